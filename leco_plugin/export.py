@@ -44,6 +44,7 @@ from leco_plugin.export_surface import (
     photograph_colours,
     require_few,
     require_not_its_own,
+    shown_part,
     write_ply,
     write_splat_init,
     write_volume,
@@ -140,7 +141,8 @@ def _export_points(
     back: Tensor | None,
     description: Path | None,
 ) -> dict[str, Any]:
-    """Writes the kept surface as `ply` or `splat-init`."""
+    """Writes the kept surface as `ply` or `splat-init`, as far as the photographs show it."""
+    surface = shown_part(surface, to_the_data(occupancy), description)
     if back is not None:
         surface = surface._replace(positions=moved(surface.positions.double(), back))
     if format == "splat-init":

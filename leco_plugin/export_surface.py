@@ -34,6 +34,7 @@ from leco_plugin.scenes.coloured_points import (
     coloured_points,
     colours_near,
     georeference,
+    views_of,
 )
 from leco_plugin.scenes.frames import inverse, moved
 from leco_plugin.scenes.input_error import InputError
@@ -49,6 +50,10 @@ CELLS_AT_ONCE = 1 << 20
 """Cells whose places are known together; of the others only o(x) is."""
 NEAR_PEAK = 0.9
 """Of the largest o(x) along a ray: from there on is matter."""
+MATTER = 0.5
+"""Of the largest o(x) of all, the least that is matter: haze before a wall of the box has less."""
+SHOWN_BY = 2
+"""Photographs that show an exported point: one alone does not say how far away it is."""
 REACH = 1 / 16
 """Of the longest side, before and behind a cell, along which o(x) is compared."""
 COLOURS = "magma"
@@ -101,24 +106,28 @@ def kept_surface(
             f"the occupancy keeps nothing in cells of 1/{resolution} of its space: there is no "
             "surface to export"
         )
-    chosen = kept if len(cameras) else exposed(kept)
-    places = torch.stack(
-        [axis[index] for axis, index in zip(axes, chosen.nonzero(as_tuple=True))], dim=-1
-    )
-    if len(cameras):
-        cell = float((box.high - box.low).max()) / resolution
-        met = []
-        for number, part in enumerate(places.split(CELLS_AT_ONCE >> 4)):
-            met.append(_first_met(occupancy, part, cameras, cell, round(REACH * resolution)))
-            on_progress(0.3 + 0.7 * min(1.0, (number + 1) * (CELLS_AT_ONCE >> 4) / len(places)))
-        places = places[torch.cat(met)]
-        if not len(places):
-            raise ValueError(
-                "no camera sees a surface of what is kept: all of them lie inside it; look at it "
-                "with leco inspect"
-            )
-        chosen = chosen.masked_scatter(kept, torch.cat(met))
-    return KeptSurface(_unmap(occupancy, places), values[chosen])
+    if not len(cameras):
+        shell = exposed(kept)
+        return KeptSurface(_unmap(occupancy, _at(axes, shell)), values[shell])
+    matter = kept & (values >= MATTER * values.max())
+    cell = float((box.high - box.low).max()) / resolution
+    places, met = _at(axes, matter), []
+    for number, part in enumerate(places.split(CELLS_AT_ONCE >> 4)):
+        met.append(_first_met(occupancy, part, cameras, cell, round(REACH * resolution)))
+        on_progress(0.3 + 0.7 * min(1.0, (number + 1) * (CELLS_AT_ONCE >> 4) / len(places)))
+    places = places[torch.cat(met)]
+    if not len(places):
+        raise ValueError(
+            "no camera sees a surface of what is kept: all of them lie inside it; look at it with "
+            "leco inspect"
+        )
+    return KeptSurface(_unmap(occupancy, places), values[matter][torch.cat(met)])
+
+
+def _at(axes: Sequence[Tensor], chosen: Tensor) -> Tensor:
+    """Middles [K, 3] of chosen cells, bool [X, Y, Z], between whose middles along each axis."""
+    numbers = zip(axes, chosen.nonzero(as_tuple=True))
+    return torch.stack([axis[index] for axis, index in numbers], dim=-1)
 
 
 def _first_met(
@@ -150,6 +159,27 @@ def _first_met(
 def _unmap(occupancy: Occupancy, mapped: Tensor) -> Tensor:
     """Scene positions [..., 3] on the CPU, of mapped ones."""
     return occupancy.space.unmap(mapped.to(occupancy.threshold_value.device)).cpu()
+
+
+def shown_part(surface: KeptSurface, back: Tensor | None, description: Path | None) -> KeptSurface:
+    """Of a surface in the coordinates of a run, what `SHOWN_BY` photographs may show; all of it
+    where it is not known what they show.
+
+    Raises:
+        ValueError: that is none of it.
+    """
+    if back is None or description is None:
+        return surface
+    views = views_of(description, moved(surface.positions.double(), back).numpy())
+    if views is None:
+        return surface
+    shown = torch.from_numpy(views >= SHOWN_BY)
+    if not bool(shown.any()):
+        raise ValueError(
+            f"no {SHOWN_BY} photographs of {description} show the surface of what is kept: is it "
+            "the scene that the occupancy was learned on? (--data names another)"
+        )
+    return KeptSurface(surface.positions[shown], surface.values[shown])
 
 
 def mapped_box(occupancy: Occupancy) -> ViewBox:

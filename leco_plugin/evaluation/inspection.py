@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from leco_plugin.learning.quality import (
+    AT_END,
     FIELD,
-    ON_TESTS,
     ONE_COLOUR,
     doubts_of_field,
     doubts_of_occupancy,
@@ -97,14 +97,15 @@ def describe(occupancy: Occupancy) -> dict[str, Any]:
 
 
 def doubts(facts: dict[str, Any]) -> list[str]:
-    """What was said when the occupancy was frozen, or at the end of its run, if it or its field are
+    """What was said at the end of its run, or when the occupancy was frozen, if it or its field are
     of no use; `facts` are of `describe`."""
     found: list[str] = []
-    for report in (facts["report"], facts["report"].get(ON_TESTS)):
-        figures = report if isinstance(report, dict) else {}
-        field, one_colour = (figures.get(name) for name in (FIELD, ONE_COLOUR))
-        if isinstance(field, float) and isinstance(one_colour, float):
-            found = found or doubts_of_field(field, one_colour)
+    report = facts["report"]
+    at_end = report.get(AT_END)
+    figures = at_end if isinstance(at_end, dict) else report
+    field, one_colour = (figures.get(name) for name in (FIELD, ONE_COLOUR))
+    if isinstance(field, float) and isinstance(one_colour, float):
+        found = doubts_of_field(field, one_colour)
     kept = facts["kept_share_of_box"] / max(facts["seen_share_of_box"], 1e-12)
     return found or doubts_of_occupancy(kept)
 

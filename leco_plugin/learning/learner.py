@@ -323,15 +323,14 @@ class Learner:
         if found is None:
             return
         seconds = seconds_now() - started
-        say(
-            f"step {step}: a gate of {found.params:,} values, taught in {seconds:.0f} s, "
-            f"{found.line}"
-        )
+        taught = f"a gate of {found.params:,} values, taught in {seconds:.0f} s"
+        say(f"step {step}: {taught}, {found.line}")
         if not found.pays:
             return
         report = found.report(mixture.report, mixture.gate.config)
         report["sharpened"] = [*report.get("sharpened", []), [step, round(seconds, 2)]]
         mixture.sharpen(found.gate.to(mixture.device), found.measured.threshold, report)
+        say(views_in_words(report))
         self.watch.state.evidence = {}  # of what guided before
         self.watch.put_off(step)
         if self.run.folder is not None:

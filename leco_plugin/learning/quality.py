@@ -20,8 +20,9 @@ LEAST_GAIN_DB = 1.0
 """PSNR by which a field that has learned something is above one colour for all pixels."""
 FIELD, ONE_COLOUR = "field_psnr_db", "one_colour_psnr_db"
 """Names in a report: PSNR on the calibration rays, of the field and of their mean colour."""
-ON_TESTS = "on_tests"
-"""Name in the report of a run that failed: the same two on test photographs, at its end."""
+AT_END = "at_end"
+"""Name in the report that a run leaves: the same two at its end, on test photographs if it has any;
+they overrule those of freezing."""
 PLACES = 1 << 14
 
 

@@ -1,4 +1,4 @@
-"""Sparse points of a scene with the colours of its photographs, and the colours near other places.
+"""What a scene's files say of places: colours of sparse points nearby, photographs that show them.
 
 All in the coordinates of the scene's own files.
 """
@@ -132,6 +132,39 @@ def camera_places(description: Path) -> NDArray[np.float64]:
         return poses.reshape(-1, 4, 4)[:, :3, 3]
     except (KeyError, TypeError, ValueError):
         return np.zeros((0, 3))
+
+
+WIDER = 0.05
+"""Share of its size by which an image counts as wider: its lens may bend outwards."""
+PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+"""Camera models whose images show what lies before them."""
+
+
+def views_of(description: Path, places: NDArray[np.float64]) -> NDArray[np.int64] | None:
+    """How many photographs of a transforms.json may show places [N, 3], for all that hides them:
+    [N]; None where it does not say how they were taken, or by a lens that sees around corners."""
+    meta = load_json(description)
+    counts = np.zeros(len(places), dtype=np.int64)
+    try:
+        for frame in meta["frames"]:
+            lens = {**meta, **frame}
+            if lens.get("camera_model", PINHOLES[0]) not in PINHOLES:
+                return None
+            size = np.array([lens["w"], lens["h"]], dtype=np.float64)
+            focal = np.array([lens["fl_x"], lens.get("fl_y", lens["fl_x"])], dtype=np.float64)
+            centre = np.array([lens.get("cx", size[0] / 2), lens.get("cy", size[1] / 2)])
+            pose = np.array(frame["transform_matrix"], dtype=np.float64)
+            if not all(np.isfinite(part).all() for part in (size, focal, centre, pose)):
+                return None
+            local = (places - pose[:3, 3]) @ pose[:3, :3]
+            ahead = -local[:, 2]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                pixels = centre + focal * local[:, :2] * [1.0, -1.0] / ahead[:, None]
+            inside = (pixels >= -WIDER * size) & (pixels <= (1.0 + WIDER) * size)
+            counts += inside.all(axis=1) & (ahead > 0.0)
+    except (KeyError, TypeError, ValueError, IndexError):
+        return None
+    return counts
 
 
 def georeference(description: Path) -> dict[str, Any]:

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -44,16 +46,33 @@ class Header(NamedTuple):
     """EXIF's: 1 is upright, from 5 on width and height change places."""
     several: bool
     """Whether it holds more pictures than one and a preview."""
+    format: str
+    """Pillow's name of the kind of file, whatever its name ends in."""
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Image.Image]:
+    """An image that Pillow has opened, without its warning that a large one may be an attack."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        with Image.open(path) as image:
+            yield image
 
 
 def header_of(path: Path) -> Header:
     """What a file of an image says. InputError if it is none."""
     try:
-        with Image.open(path) as image:
+        with opened(path) as image:
             several = image.format != "MPO" and getattr(image, "n_frames", 1) > 1
             transparent = image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info
-            return Header(image.size, image.mode, transparent, _orientation(image), several)
-    except (OSError, ValueError, EOFError, SyntaxError, Image.DecompressionBombError):
+            turned, kind = _orientation(image), image.format or ""
+            return Header(image.size, image.mode, transparent, turned, several, kind)
+    except Image.DecompressionBombError:
+        most = 2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6
+        raise InputError(
+            f"{path} has more than the {most:.0f} megapixels that Pillow opens: make it smaller"
+        ) from None
+    except (OSError, ValueError, EOFError, SyntaxError):
         if not path.exists():
             raise InputError(f"the image {path} is not there{remedy_for_missing(path)}") from None
         raise InputError(f"{path} cannot be read as an image: {SAVE_ANEW}") from None
@@ -131,7 +150,7 @@ def is_turned(header: Header, size: tuple[int, int]) -> bool:
 def decode(path: Path, turn: bool) -> Image.Image:
     """The plain colours of an image, turned as EXIF says if asked. InputError if it has none."""
     try:
-        with Image.open(path) as image:
+        with opened(path) as image:
             turned = ImageOps.exif_transpose(image) if turn else image
             return plain(turned).copy()
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:

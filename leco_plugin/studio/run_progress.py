@@ -34,8 +34,8 @@ from torch import Tensor, nn
 from leco_plugin.evaluation.held_out_psnr import OF, HeldOutPsnr
 from leco_plugin.evaluation.inspection import describe, doubts
 from leco_plugin.evaluation.metrics import FigureUnavailable
-from leco_plugin.learning.freezing import FILE_NAME
-from leco_plugin.learning.quality import FIELD, ON_TESTS, ONE_COLOUR
+from leco_plugin.learning.freezing import FILE_NAME, leave_file
+from leco_plugin.learning.quality import AT_END, FIELD, ONE_COLOUR
 from leco_plugin.log import Show, bar, details_in, on_screen, say, say_all, spell
 from leco_plugin.models.compute.ranks import is_first
 from leco_plugin.occupancy import Occupancy
@@ -179,12 +179,12 @@ class RunProgress:
         say(", ".join(filter(None, [line, reached, of_tests])))
         folder = Path(self.trainer.base_dir)
         occupancy = folder / FILE_NAME
-        if doubted := self.psnr.doubts(self.psnr.latest if tested is None else tested):
-            say_all(doubted)
-            if tested is not None and occupancy.exists():
-                note_failure(occupancy, tested, self.psnr.of_one_colour)
-        elif occupancy.exists():
+        last = self.psnr.latest if tested is None else tested
+        if occupancy.exists():
+            note_end(occupancy, last, self.psnr.of_one_colour)
             say_all(doubts(describe(Occupancy.load(occupancy))))
+        else:
+            say_all(self.psnr.doubts(last))
         say(f"  run        {folder}")
         if occupancy.exists():
             say(f"  occupancy  {occupancy}, {occupancy.stat().st_size / 1e3:.0f} kB")
@@ -194,13 +194,14 @@ class RunProgress:
             say(f"  {command}")
 
 
-def note_failure(path: Path, field: float, one_colour: float) -> None:
-    """Keeps what test photographs say of a run that failed in the report of its occupancy, whose
-    inspection repeats it. All processes may come here; the first writes."""
-    if is_first():
-        occupancy = Occupancy.load(path)
-        occupancy.report = {**occupancy.report, ON_TESTS: {FIELD: field, ONE_COLOUR: one_colour}}
-        occupancy.save(path)
+def note_end(path: Path, field: float | None, one_colour: float) -> None:
+    """Keeps what a run has reached in the report of its occupancy, so that its inspection repeats
+    what is bad. All processes may come here; the first writes."""
+    if field is None or not is_first():
+        return
+    occupancy = Occupancy.load(path)
+    occupancy.report = {**occupancy.report, AT_END: {FIELD: field, ONE_COLOUR: one_colour}}
+    leave_file(occupancy, path.parent)
 
 
 def next_commands(folder: Path, occupancy: bool, tests: bool) -> list[str]:

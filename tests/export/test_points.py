@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
@@ -11,8 +12,16 @@ import torch
 import trimesh
 from ball_occupancy import CENTRE, HALF, RADIUS, ball
 
-from leco_plugin.export_surface import finest, kept_surface, mapped_box, write_ply
+from leco_plugin.export_surface import (
+    KeptSurface,
+    finest,
+    kept_surface,
+    mapped_box,
+    shown_part,
+    write_ply,
+)
 from leco_plugin.occupancy import Occupancy
+from leco_plugin.scenes.coloured_points import views_of
 from leco_plugin.space import Space
 
 
@@ -56,6 +65,54 @@ def test_other_programs_read_places_and_colours(tmp_path: Path) -> None:
     brightness = cloud.colors[:, :3].sum(axis=1).astype(float)
     assert np.corrcoef(brightness, surface.values.numpy())[0, 1] > 0.9
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["kept.ply"]
+
+
+PINHOLE = {"w": 100, "h": 50, "fl_x": 50.0, "fl_y": 50.0, "cx": 50.0, "cy": 25.0}
+
+
+def scene_of(tmp_path: Path, *eyes: tuple[float, float, float], **lens: object) -> Path:
+    """Cameras that look down, in nerfstudio's format."""
+    frames = [
+        {"file_path": "a.jpg", "transform_matrix": [[1, 0, 0, x], [0, 1, 0, y], [0, 0, 1, z]]}
+        for x, y, z in eyes
+    ]
+    file = tmp_path / "transforms.json"
+    file.write_text(json.dumps({**PINHOLE, **lens, "frames": frames}))
+    return file
+
+
+def test_photographs_show_what_lies_before_them_within_their_images(tmp_path: Path) -> None:
+    """A camera 2 above: 2 to each side along x, 1 along y, and a twentieth of the image more."""
+    places = np.array(
+        [[0, 0, 0], [1.9, 0, 0], [2.3, 0, 0], [0, 0.9, 0], [0, 1.2, 0], [0, 0, 3.0], [4, 0, 0]]
+    )
+    one, far = scene_of(tmp_path, (0.0, 0.0, 2.0)), (2.0, 0.0, 4.0)
+    assert (found := views_of(one, places)) is not None
+    assert found.tolist() == [1, 1, 0, 1, 0, 0, 0]
+    both = views_of(scene_of(tmp_path, (0.0, 0.0, 2.0), far), places)
+    assert both is not None and both.tolist() == [2, 2, 1, 2, 1, 0, 1]
+    # the image is flipped upright: rows count downwards
+    above = views_of(scene_of(tmp_path, (0.0, 0.0, 2.0), cy=0.0), places)
+    assert above is not None and above.tolist() == [1, 1, 0, 0, 0, 0, 0]
+    for lens in ({"camera_model": "OPENCV_FISHEYE"}, {"fl_x": None}, {"w": "wide"}):
+        assert views_of(scene_of(tmp_path, far, **lens), places) is None
+
+
+def test_points_that_no_two_photographs_show_are_left_out(tmp_path: Path) -> None:
+    surface = KeptSurface(torch.tensor([[0.0, 0, 0], [1.9, 0, 0]]), torch.ones(2))
+    eyes, back = ((0.0, 0.0, 2.0), (-1.0, 0.0, 2.0)), torch.eye(3, 4).double()
+    assert len(shown_part(surface, back, scene_of(tmp_path, *eyes)).positions) == 1
+    for unknown in ((None, scene_of(tmp_path, *eyes)), (back, None)):
+        assert len(shown_part(surface, *unknown).positions) == 2
+    with pytest.raises(ValueError, match=r"no 2 photographs of .* show the surface"):
+        shown_part(surface, back, scene_of(tmp_path, *eyes[:1]))
+
+
+def test_haze_that_fills_what_is_kept_is_no_surface() -> None:
+    known = ball()
+    occupancy = Occupancy(known.gate, known.space, 1e-6, report=known.report).eval()
+    largest = float(kept_surface(known, 64).values.max())
+    assert float(kept_surface(occupancy, 64).values.min()) >= 0.5 * largest
 
 
 def test_an_unbounded_scene_has_points_beyond_its_inner_cube() -> None:

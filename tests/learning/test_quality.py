@@ -11,8 +11,8 @@ from small_learner import small_mixture
 
 from leco_plugin.evaluation.inspection import describe, doubts
 from leco_plugin.learning.quality import (
+    AT_END,
     FIELD,
-    ON_TESTS,
     ONE_COLOUR,
     doubts_of_field,
     doubts_of_occupancy,
@@ -20,7 +20,7 @@ from leco_plugin.learning.quality import (
     psnr_of_one_colour,
 )
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.studio.run_progress import note_failure
+from leco_plugin.studio.run_progress import note_end
 
 
 def test_one_colour_is_scored_as_the_mean_of_all_pixels() -> None:
@@ -46,8 +46,11 @@ def test_inspection_repeats_what_was_said() -> None:
     assert "91%" in doubts(facts)[0]
     facts["report"] = {FIELD: 7.0, ONE_COLOUR: 10.4}
     assert "7.0 dB" in doubts(facts)[0]
-    facts["report"] = {FIELD: 22.3, ONE_COLOUR: 10.4, ON_TESTS: {FIELD: 10.9, ONE_COLOUR: 10.4}}
+    facts["report"] = {FIELD: 22.3, ONE_COLOUR: 10.4, AT_END: {FIELD: 10.9, ONE_COLOUR: 10.4}}
     assert "10.9 dB" in doubts(facts)[0]
+    # a field that was poor at freezing, or another run's, has learned since
+    facts["report"] = {FIELD: 11.0, ONE_COLOUR: 10.4, AT_END: {FIELD: 25.3, ONE_COLOUR: 10.4}}
+    assert "91%" in doubts(facts)[0]
     facts = {"report": {FIELD: 20.0, ONE_COLOUR: 10.4}, **{k: 0.1 for k in facts if "share" in k}}
     facts["seen_share_of_box"] = 0.5
     assert doubts(facts) == []
@@ -67,11 +70,14 @@ def test_of_a_contraction_only_the_inner_cube_says_what_is_kept_of_what_is_seen(
     assert kept_of_seen(mixture) == 0.0
 
 
-def test_a_run_that_failed_on_tests_says_so_in_its_occupancy(tmp_path: Path) -> None:
+def test_what_a_run_reached_is_kept_in_its_occupancy(tmp_path: Path) -> None:
     path = tmp_path / "occupancy.safetensors"
     ball().save(path)
-    note_failure(path, 10.9, 10.4)
-    occupancy = Occupancy.load(path)
-    assert "10.9 dB on unseen pixels, where one colour" in doubts(describe(occupancy))[0]
+    for last in (10.9, None):  # None: nothing was measured
+        note_end(path, last, 10.4)
+        occupancy = Occupancy.load(path)
+        assert "10.9 dB on unseen pixels, where one colour" in doubts(describe(occupancy))[0]
     assert occupancy.report.items() >= ball().report.items()
     assert torch.equal(occupancy.gate.head.weight, ball().gate.head.weight)
+    note_end(path, 25.3, 10.4)
+    assert doubts(describe(Occupancy.load(path))) == []

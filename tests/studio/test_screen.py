@@ -19,9 +19,11 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from tiny_run import tiny_config
 
 from leco_plugin.evaluation import held_out_psnr
+from leco_plugin.evaluation.inspection import describe, doubts
 from leco_plugin.host_configs import leco_ngp
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig
+from leco_plugin.occupancy import Occupancy
 from leco_plugin.studio.run_progress import LOG, next_commands, short_screen
 
 MOST_LINES = 40
@@ -79,15 +81,18 @@ def test_a_scene_that_fails_is_said_to_fail_before_at_freezing_and_at_the_end(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Where PSNR at the end is no reason, what is known of the occupancy still is."""
+    """At the end test photographs decide; held-out pixels are easier. Inspection repeats it."""
     if not by_tests:
-        monkeypatch.setattr(held_out_psnr.HeldOutPsnr, "doubts", lambda *_: [])
+        monkeypatch.setattr(held_out_psnr.HeldOutPsnr, "look_at_tests", lambda *_: None)
     screen = "\n".join(run(watched(tiny_scene, tmp_path), capsys)[0])
     before, at_freezing = screen.split("occupancy learned in")
     at_freezing, at_the_end = at_freezing.split("finished:")
     assert "training photographs are few" in before and "bounds are guessed" in before
-    for part in (at_freezing, at_the_end):
-        assert part.count("this scene was not learned") == part.count("what helps: more") == 1
+    last = "this scene was not learned" if by_tests else "this occupancy is of little use"
+    for part, said in ((at_freezing, "this scene was not learned"), (at_the_end, last)):
+        assert part.count(said) == part.count("what helps: more") == 1
+    (file,) = tmp_path.rglob("occupancy.safetensors")
+    assert last in doubts(describe(Occupancy.load(file)))[0]
 
 
 def test_a_guided_host_shows_psnr_while_it_learns_and_after(

@@ -16,6 +16,7 @@ from leco_plugin.scenes.input_error import InputError, require
 from leco_plugin.scenes.locks import LOCK, alone_in
 from leco_plugin.scenes.poses import ASKED
 from leco_plugin.scenes.poses.georeference import (
+    POINTS,
     Placement,
     local_places,
     place,
@@ -36,6 +37,7 @@ from leco_plugin.scenes.poses.reconstruction import (
     choose_pairs,
     load_pycolmap,
 )
+from leco_plugin.scenes.scene_file import load_json
 from leco_plugin.scenes.whole_files import remove_parts, write_json
 
 REPORT = "poses.json"
@@ -64,8 +66,8 @@ def make_scene(
     require(size >= 100, "size", size, "100 pixels or more")
     require(threads >= 0, "threads", threads, "0 for all, or a number of them")
     pycolmap = load_pycolmap()
-    out, began = out.absolute(), time.monotonic()
-    found = find_photographs(folder.absolute(), out)
+    folder, out, began = folder.resolve(), out.resolve(), time.monotonic()
+    found = find_photographs(folder, out)
     asked = _asked(found.photographs, lens, size)
     if finished := _finished(out, asked):
         print(f"{out} already holds this scene: nothing is done")
@@ -88,8 +90,8 @@ def make_scene(
         work.refine(models[0], lens)
         gps = {each.name: gps for each, gps in zip(photographs, places)}
         placement = _put_in_the_world(pycolmap, models[0], gps)
-        sources = {each.name: str(each.path.relative_to(folder.absolute())) for each in photographs}
-        refused = sorted(str(path.relative_to(folder.absolute())) for path in found.refused)
+        sources = {each.name: str(each.path.relative_to(folder)) for each in photographs}
+        refused = sorted(str(path.relative_to(folder)) for path in found.refused)
         report = _report(models, sources, placement) | {
             "not_read": refused,
             "altitudes": any(each.position and np.isfinite(each.position[2]) for each in exifs),
@@ -103,7 +105,7 @@ def make_scene(
 
 def _asked(photographs: list[Photograph], lens: Lens, size: int) -> dict[str, Any]:
     """What is asked for: JSON values, those of photographs and of their GPS as digests."""
-    known = [(each.name, each.path.stat().st_size) for each in photographs]
+    known = [each.content for each in photographs]
     positions = [each.exif.position for each in photographs]
     asked = {"format": 1, "photographs": len(photographs), "digest": _digest(known)}
     return {**asked, GPS: _digest(positions), "lens": lens, "size": size}
@@ -136,10 +138,19 @@ def _finished(out: Path, asked: dict[str, Any]) -> dict[str, Any] | None:
         raise InputError(
             f"--out {out} was begun with other {what}: give another folder, or delete it"
         )
-    if found != asked or not (out / "transforms.json").is_file():
+    if found != asked or not _is_whole(out):
         return None
     report: dict[str, Any] = json.loads((out / REPORT).read_text())
     return report
+
+
+def _is_whole(out: Path) -> bool:
+    """Whether all files of a finished scene are there."""
+    description = out / "transforms.json"
+    if not description.is_file():
+        return False
+    named = [frame["file_path"] for frame in load_json(description)["frames"]]
+    return all((out / name).is_file() for name in (*named, POINTS, REPORT))
 
 
 def _begin(out: Path, asked: dict[str, Any]) -> None:

@@ -125,10 +125,23 @@ def place(pycolmap: Any, centres: Array, gps: Array, up: Array) -> Placement:
     matrix, inlier = found["tgt_from_src"].matrix(), np.asarray(found["inlier_mask"], dtype=bool)
     scale = float(np.linalg.det(matrix[:, :3])) ** (1.0 / 3.0)
     turn = roll_upright(matrix[:, :3] / scale, gps[known][inlier], up, options.max_error)
+    if (turn @ up)[2] < 0.0 and _lie_in_a_plane(gps[known][inlier], options.max_error):
+        # positions at one height fit as well upside down
+        return _by_direction(
+            up,
+            "GPS is mirrored: it fits the poses only upside down; mend the references to north or "
+            "south, east or west in EXIF",
+        )
     middles = gps[known][inlier].mean(axis=0), centres[known][inlier].mean(axis=0)
     placed = Placement(scale, turn, middles[0] - scale * turn @ middles[1])
     residuals = np.linalg.norm(placed.apply(centres) - gps, axis=1)
     return Placement(scale, turn, placed.shift, residuals)
+
+
+def _lie_in_a_plane(places: Array, width: float) -> bool:
+    """Whether places [N, 3] stand out of their plane by less than `width` metres, on average."""
+    away = places - places.mean(axis=0)
+    return bool(np.linalg.svd(away, compute_uv=False)[-1] < width * np.sqrt(len(places)))
 
 
 def tolerance(spread: float) -> float:

@@ -7,12 +7,14 @@ only read.
 from __future__ import annotations
 
 import math
+import os
 import re
 import shutil
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -95,7 +97,8 @@ def _degrees(parts: Any, reference: Any) -> float:
         return math.nan
     degrees, minutes, seconds = (_number(part, math.nan) for part in parts)
     total = degrees + minutes / 60.0 + seconds / 3600.0
-    return -total if str(reference).strip().upper()[:1] in ("S", "W") else total
+    named = reference.decode("ascii", "replace") if isinstance(reference, bytes) else str(reference)
+    return -total if named.strip("\0 ").upper()[:1] in ("S", "W") else total
 
 
 def _time(details: Mapping[int, Any]) -> float | None:
@@ -123,8 +126,11 @@ HEIC = (".heic", ".heif")
 KINDS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", *HEIC)
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf")
 FILMS = (".mp4", ".mov", ".avi", ".mkv", ".m4v")
-COPIED = (".jpg", ".jpeg", ".png")
-"""Kinds that are copied byte by byte where their colours need no change."""
+COPIED = {"JPEG": (".jpg", ".jpeg"), "MPO": (".jpg", ".jpeg"), "PNG": (".png",)}
+"""Kinds, by Pillow's name, that are copied byte by byte where their colours need no change and
+their names end so: pycolmap reads no other."""
+SCAN, DESCRIPTIONS = 0xDA, (*range(0xE0, 0xF0), 0xFE)
+"""Markers in a JPEG: where pixels begin, and segments of applications, EXIF's, and comments."""
 FEWEST = 3
 LONGEST = 80
 """Letters of a copy's name, its last ones: of 255 bytes that one may have, each takes up to 3."""
@@ -149,6 +155,11 @@ class Photograph:
         return (height, width) if self.header.orientation >= 5 else (width, height)
 
     @property
+    def content(self) -> tuple[str, tuple[int, int], int]:
+        """What tells whether it is the same picture: name, size, and bytes without its EXIF."""
+        return self.name, self.size, self.path.stat().st_size - described_bytes(self.path)
+
+    @property
     def lens(self) -> tuple[object, ...]:
         """The same of photographs that share their intrinsics."""
         return (self.size, self.exif.camera)
@@ -157,7 +168,20 @@ class Photograph:
     def is_copied(self) -> bool:
         """Whether the copy has the bytes of the original."""
         upright = self.header.orientation == 1 and is_plain(self.header)
-        return upright and self.path.suffix.lower() in COPIED
+        return upright and self.path.suffix.lower() in COPIED.get(self.header.format, ())
+
+
+def described_bytes(path: Path) -> int:
+    """Bytes of a JPEG that say something of its picture, as EXIF does; 0 of other kinds."""
+    found = 0
+    with path.open("rb") as file:
+        if file.read(2) != b"\xff\xd8":
+            return 0
+        while len(head := file.read(4)) == 4 and head[0] == 0xFF and head[1] != SCAN:
+            length = int.from_bytes(head[2:], "big")
+            found += 2 + length if head[1] in DESCRIPTIONS else 0
+            file.seek(length - 2, os.SEEK_CUR)
+    return found
 
 
 class Found(NamedTuple):
@@ -195,9 +219,9 @@ def find_photographs(folder: Path, out: Path) -> Found:
             kinds = ", ".join(sorted(KINDS))
             remedy = f"give the folder that holds them; files that end in {kinds} are read"
         raise InputError(f"{folder} has {number}, and {FEWEST} or more are needed: {remedy}")
-    _allow_heic([path for path in found if path.suffix.lower() in HEIC])
-    refused: dict[Path, str] = {}
-    photographs = [each for path in found if (each := _or_why(_read, path, folder, refused))]
+    refused = _unreadable_heic([path for path in found if path.suffix.lower() in HEIC])
+    read = [path for path in found if path not in refused]
+    photographs = [each for path in read if (each := _or_why(_read, path, folder, refused))]
     _refuse_mixed_alpha(photographs)
     if len({photograph.name.lower() for photograph in photographs}) < len(photographs):
         digits = len(str(len(photographs)))
@@ -244,18 +268,15 @@ def _read(path: Path, folder: Path) -> Photograph:
     return replace(photograph, name=name if name.endswith(ending) else name + ending)
 
 
-def _allow_heic(files: list[Path]) -> None:
-    """Lets Pillow read HEIC. InputError if there are such files and nothing that reads them."""
-    if not files:
-        return
+def _unreadable_heic(files: list[Path]) -> dict[Path, str]:
+    """Lets Pillow read HEIC; where it cannot, these files, each with a line that says why."""
     try:
-        from pillow_heif import register_heif_opener
+        if files:
+            import_module("pillow_heif").register_heif_opener()
     except ImportError:
-        raise InputError(
-            f"{len(files)} photographs are HEIC, as {files[0].name}: "
-            "`pip install pillow-heif` reads them, or save them as JPEG"
-        ) from None
-    register_heif_opener()
+        why = "is HEIC: `pip install pillow-heif` reads it, or save it as JPEG"
+        return {path: f"{path} {why}" for path in files}
+    return {}
 
 
 def _refuse_mixed_alpha(photographs: list[Photograph]) -> None:

@@ -108,6 +108,34 @@ def test_a_finished_scene_is_left_as_it_is(
 
 
 @pytest.mark.slow
+def test_a_finished_scene_gets_a_picture_back_that_was_lost(
+    made: Path, photos: Path, tmp_path: Path, pycolmap: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lost = tmp_path / "lost"
+    shutil.copytree(made, lost)
+    (lost / "images" / "IMG_0000.jpg").unlink()
+    (lost / "sparse_pc.ply").unlink()
+    monkeypatch.setattr(pycolmap, "incremental_mapping", None)
+    assert make_scene(photos, lost, threads=1)["placed"] == 12
+    assert (lost / "images" / "IMG_0000.jpg").is_file() and (lost / "sparse_pc.ply").is_file()
+
+
+@pytest.mark.slow
+def test_a_scene_within_its_photographs_is_known_by_any_path(
+    pycolmap: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    folder = tmp_path / "photos"
+    write_survey(folder, grid(3, 2))
+    monkeypatch.chdir(tmp_path)
+    report = make_scene(Path("photos"), Path("../") / tmp_path.name / "photos" / "out", threads=1)
+    assert make_scene(Path("photos"), Path("photos/out"), threads=1) == report
+    assert "nothing is done" in capsys.readouterr().out
+
+
+@pytest.mark.slow
 def test_a_run_that_was_killed_goes_on_with_what_is_missing(
     made: Path, photos: Path, tmp_path: Path, pycolmap: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -127,6 +155,15 @@ def test_a_run_that_was_killed_goes_on_with_what_is_missing(
     assert not [*killed.rglob("*.part")]
 
 
+def with_exif(jpeg: bytes, exif: Image.Exif) -> bytes:
+    """The same pixels with other EXIF."""
+    rest = jpeg[2:]
+    while rest[:2] in (b"\xff\xe0", b"\xff\xe1"):
+        rest = rest[2 + int.from_bytes(rest[2:4], "big") :]
+    said = exif.tobytes()
+    return b"\xff\xd8\xff\xe1" + (len(said) + 2).to_bytes(2, "big") + said + rest
+
+
 @pytest.mark.slow
 def test_a_survey_whose_gps_is_mended_is_placed_anew_from_its_matches(
     pycolmap: Any,
@@ -134,17 +171,17 @@ def test_a_survey_whose_gps_is_mended_is_placed_anew_from_its_matches(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Mending EXIF leaves the sizes of files as they were."""
+    """As exiftool mends it: pixels stay as they are, and files get longer."""
     folder, out, places = tmp_path / "photos", tmp_path / "out", grid(3, 2)
     paths = write_survey(folder, places)
-    right, size = [path.read_bytes() for path in paths], 1 << 17
+    right = [path.read_bytes() for path in paths]
     for path, wrong in zip(paths, np.random.default_rng(1).permutation(6)):
-        with Image.open(path) as image:
-            image.save(path, quality=95, exif=exif_of(places[wrong]))
-        path.write_bytes(path.read_bytes().ljust(size, b"\0"))
+        shuffled = exif_of(places[wrong] if wrong else None)
+        path.write_bytes(with_exif(path.read_bytes(), shuffled))
     assert not make_scene(folder, out, threads=1)["gps"]["used"]
+    assert paths[0].stat().st_size != len(right[0]) or paths[1].stat().st_size != len(right[1])
     for path, content in zip(paths, right):
-        path.write_bytes(content.ljust(size, b"\0"))
+        path.write_bytes(content)
     monkeypatch.setattr(pycolmap, "extract_features", None)
     report = make_scene(folder, out, threads=1)
     assert "EXIF has other GPS than before" in capsys.readouterr().out

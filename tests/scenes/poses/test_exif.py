@@ -31,13 +31,14 @@ def test_position_time_and_lens_are_read() -> None:
     ("gps", "wanted"),
     [
         ({1: "S", 2: (10.0, 30.0, 36.0), 3: "W", 4: (20.0, 0.0, 0.0)}, (-10.51, -20.0)),
+        ({1: b"S\0", 2: (10.0, 30.0, 36.0), 3: "\0W", 4: (20.0, 0.0, 0.0)}, (-10.51, -20.0)),
         ({1: "N", 2: (0.0, 0.0, 0.0), 3: "E", 4: (0.0, 0.0, 0.0)}, None),
         ({1: "N", 2: (95.0, 0.0, 0.0), 3: "E", 4: (1.0, 0.0, 0.0)}, None),
         ({1: "N", 2: (45.0, 0.0, 0.0)}, None),
         ({1: "N", 2: 45.0, 3: "E", 4: 1.0}, None),
         ({}, None),
     ],
-    ids=["south and west", "no satellites", "no latitude", "half", "one part", "none"],
+    ids=["south and west", "as bytes", "no satellites", "no latitude", "half", "one part", "none"],
 )
 def test_a_position_is_of_the_globe_or_none(
     gps: dict[int, object], wanted: tuple[float, float] | None

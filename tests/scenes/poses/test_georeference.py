@@ -168,6 +168,23 @@ def test_gps_that_contradicts_the_poses_is_not_used(kind: str) -> None:
     np.testing.assert_allclose(placed.turn @ up, [0.0, 0.0, 1.0], atol=1e-9)
 
 
+@pytest.mark.parametrize("axis", [0, 1], ids=["longitude", "latitude"])
+def test_mirrored_gps_does_not_turn_a_survey_upside_down(axis: int) -> None:
+    """As where EXIF lacks the W of a longitude: cameras at one height fit after a half turn."""
+    pycolmap = pytest.importorskip("pycolmap")
+    places = survey(1)[0][:, :, 3]
+    centres, up = away(places)
+    gps = places.copy()
+    gps[:, axis] *= -1.0
+    placed = place(pycolmap, centres, gps, up)
+    assert placed.residuals is None and placed.reason.startswith("GPS is mirrored: ")
+    np.testing.assert_allclose(placed.turn @ up, [0.0, 0.0, 1.0], atol=1e-9)
+    # places in all three directions leave no doubt: what seemed to be up is wrong
+    solid = np.random.default_rng(6).normal(size=places.shape) * 40.0
+    placed = place(pycolmap, *away(solid)[:1], solid, -away(solid)[1])
+    assert placed.residuals is not None and placed.residuals.max() < 1e-3
+
+
 def test_places_are_metres_from_the_median_at_sea_level() -> None:
     pycolmap = pytest.importorskip("pycolmap")
     origin, places = local_places(

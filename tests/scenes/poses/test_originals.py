@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -194,13 +195,41 @@ def test_a_folder_of_raw_files_says_what_to_do(tmp_path: Path) -> None:
         find_photographs(tmp_path, tmp_path / "out")
 
 
-def test_heic_without_its_reader_names_the_package(
+def test_heic_without_its_reader_is_left_out_by_name(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (folder / "IMG_9.HEIC").write_bytes(b"....ftypheic")
     monkeypatch.setitem(__import__("sys").modules, "pillow_heif", None)
-    with pytest.raises(InputError, match=r"1 photographs are HEIC, .*pip install pillow-heif"):
+    found = find_photographs(folder, tmp_path / "out")
+    assert len(found.photographs) == 3
+    (why,) = found.refused.values()
+    assert "IMG_9.HEIC is HEIC: `pip install pillow-heif` reads it" in why
+    (folder / "IMG_0.jpg").unlink()
+    with pytest.raises(
+        InputError, match=r"IMG_9.HEIC is HEIC: .* \(2 of 3 photographs can be used"
+    ):
         find_photographs(folder, tmp_path / "out")
+
+
+@pytest.mark.parametrize("kind", ["WEBP", "PNG", "TIFF"])
+def test_what_a_name_says_wrongly_is_written_anew_as_its_name_says(
+    kind: str, folder: Path, tmp_path: Path
+) -> None:
+    with Image.open(folder / "IMG_0.jpg") as image:
+        image.save(folder / "IMG_1.jpg", kind)
+    assert copies(folder, tmp_path / "out")["IMG_1.jpg"].format == "JPEG"
+
+
+def test_a_picture_larger_than_pillow_opens_is_named_with_its_reason(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 32 * 24)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(copies(folder, tmp_path / "out")) == 3
+    Image.new("RGB", (64, 25)).save(folder / "IMG_7.jpg")
+    (why,) = find_photographs(folder, tmp_path / "out").refused.values()
+    assert "IMG_7.jpg has more than the 0 megapixels that Pillow opens: make it smaller" in why
 
 
 def test_heic_is_copied_as_jpeg(folder: Path, tmp_path: Path) -> None:
