@@ -180,13 +180,13 @@ def _fronts(charts: Sequence[Mapping[str, Any]]) -> str:
             its = counts.setdefault(one.name, dict.fromkeys(COSTS, 0))
             for name in fronts_of(one, held):
                 its[name] += 1
+    of = f"{len(charts)} scene{'s' if len(charts) > 1 else ''}"
     said = [
-        f"{who} is unbeaten {' and '.join(f'in {name} on {n}' for name, n in its.items())}"
+        f"{who}: nothing as small keeps less space on {its['size']} of {of}, nothing learned as "
+        f"soon on {its['learning time']}."
         for who, its in counts.items()
     ]
-    scenes = f"{len(charts)} scene{'s' if len(charts) > 1 else ''}"
-    meant = "*Unbeaten*: nothing keeps less space for less of that."
-    return f"Of {scenes}, {'; '.join(said)}. {meant}"
+    return " ".join(said)
 
 
 def _level(learned: Sequence[Learned]) -> str:

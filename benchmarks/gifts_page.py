@@ -34,9 +34,10 @@ WORDS = {"yes": "given", "-": "not"}
 HOSTS = ["leco-ngp", "leco-nerfacto", "leco-switch-nerf"]
 HEAD = f"""# Who gets what
 
-Each row of a chart trains for the same time on the same photographs. This page says what else each
-is given. What not all rows of a method have is named below its table, and whether a learned row
-without it stands beside, to show what the gift is worth.
+All rows of a chart train for the same time on the same photographs. This page says what else each
+row gets. Below each table stand the gifts that only some rows get. `leco chart --samplers
+learned-occupancy-without-gifts` charts a learned row without them; a stored one is that of
+[Instant-NGP](results.md#what-is-gained-in-the-same-time).
 
 - **Distances**: while an occupancy is learned, rays end at the sparse points that they lead to.
 - **Bounds**: the scene's walls are found from sparse points.
@@ -101,7 +102,7 @@ def missing(given: dict[str, dict[str, str]], learned: Sequence[str]) -> list[st
         others = f"{WORDS.get(most, most)} for the others"
         without = [name for name in learned if given[name][gift] != given[learned[0]][gift]]
         beside = (
-            "a learned row without it stands beside" if without else "no learned row stands beside"
+            "a learned row without it can be charted" if without else "no learned row is without it"
         )
         lines.append(f"- **{gift.capitalize()}**: {'; '.join([*parts, others])}; {beside}.")
     return [*(lines or ["- All rows have the same."]), ""]

@@ -74,7 +74,7 @@ def demo_table(report: dict[str, Any]) -> str:
 
 def gain_table(results: Mapping[str, Any]) -> str:
     """Accuracy, rendering and queries of each contender, and ours against the best row without a
-    learned occupancy, and against the best host without one."""
+    learned occupancy, and against the best other method."""
     lines = lines_of(results)
     seconds, scene = results["protocol"]["seconds"], results["scene"]["name"]
     cores = max(1, results["machine"]["threads"] // results["protocol"].get("at_once", 1))
@@ -97,7 +97,7 @@ def gain_table(results: Mapping[str, Any]) -> str:
     said = "**In the same time,** beside the best row without a learned occupancy "
     said += f"(*{best.name}*), {ours.name} is {_beside(ours, best)}"
     if host is not best:
-        said += f" Beside the best host (*{host.name}*) it is {_beside(ours, host)}"
+        said += f" Beside the best other method (*{host.name}*) it is {_beside(ours, host)}"
     words = (
         "A query asks a network about one point; *small* ones ask a proposal network or a gate. "
         "*LeCO* is the paper's model: several small networks, the *experts*. A *host* is a method "

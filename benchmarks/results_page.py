@@ -20,7 +20,7 @@ from chart_sections import chart_sections, suite_sections, titles
 from growth_picture import cities, finding, growth_table
 from large_scene_tables import LARGE_SCENES
 from learning import sentence as learning_sentence
-from page_parts import RESULTS, ROOT, machine_line, made_line, picture, section, table
+from page_parts import RESULTS, ROOT, machine_line, made_line, noted, picture, section, table
 from page_pictures import GROWTH, LEARNING, draw_pictures, is_stale, pictures
 from profile_page import profile_sections
 from readme_parts import GAIN_CHART, GIFTS_CHART, demo_table, gain, gifts_sentence, readme
@@ -65,10 +65,12 @@ Switch-NeRF, in the others the paper's model. A scene's name leads to its chart;
 """
 MORE = """## Further
 
-- **Is a grid enough?** {capacity} [Gates and grids at equal
+- **Is a grid enough?**{star} {capacity} [Gates and grids at equal
   loss](measurements.md#how-much-a-scene-needs-gates-and-grids-at-equal-loss).
-- **Does it fail, and when?** {stability} [Stability](stability.md) shows each case.
-- **How does it grow with a city?** {growth}
+- **Does it fail, and when?** {stability} The learned runs have 200 steps
+  more and begin opaque; proposal networks fail by samples beside the surface, hardly by PSNR.
+  [Stability](stability.md) shows each case.
+- **How does it grow with a city?**{star} {growth}
   [Growth](measurements.md#how-occupancy-grows-with-a-city).
 - **Where does the time of a step go?** [A profile](measurements.md#where-the-time-of-a-step-goes).
 - **On a GPU?** Nobody has measured it; [Use a GPU](gpu.md) says how to.
@@ -241,6 +243,7 @@ def page() -> str:
     parts += [f"{demo_table(demo)}\n", *bars_section(RESULTS), QUESTIONS, *short_answers()]
     stability = json.loads((RESULTS / "stability.json").read_text())
     found = {
+        "star": " (*)" if "capacity" in noted(RESULTS) else "",
         "capacity": where_it_pays(scene_results("capacity")),
         "stability": sentence(headline(stability)),
         "growth": finding(cities(scene_results("capacity"))),

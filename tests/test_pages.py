@@ -217,11 +217,11 @@ def test_a_contender_that_lacks_a_gift_is_named_on_the_page_of_gifts() -> None:
     for gift, change in lacking.items():
         other = replace(whole, name="Instant-NGP + poor", changes={**whole.changes, **change})
         (line,) = _lines_of(gift, [whole, whole, other])
-        assert "poor" in line and "a learned row without it stands beside" in line
+        assert "poor" in line and "a learned row without it can be charted" in line
         assert not _lines_of(gift, [whole, replace(whole, name="Instant-NGP + rich")])
     rates = {"optimizers.fields.optimizer.lr": 0.5}
     (line,) = _lines_of("Rates", [whole, replace(grid, settings=rates)])
-    assert "0.5" in line and "no learned row stands beside" in line
+    assert "0.5" in line and "no learned row is without it" in line
 
 
 def _lines_of(gift: str, rows: list[Contender]) -> list[str]:

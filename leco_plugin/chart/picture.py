@@ -246,7 +246,8 @@ def _draw_learning(axes: Any, lines: Sequence[Line], theme: Theme) -> None:
     heights = [BAR * (len(bars) - row - 0.2) for row in range(len(bars))]
     colours = [style(i, theme)["color"] for i, _ in bars]
     axes.hlines(heights, 0.0, [time for _, time in bars], colours, transform=foot, linewidth=5)
-    text = " of which learning the occupancy"
+    grids = any(not lines[i].learned for i, _ in bars)
+    text = " of which learning the occupancy" + (", or updating the grid" if grids else "")
     axes.text(0.0, BAR * (len(bars) + 0.6), text, transform=foot, fontsize=10)
 
 
@@ -281,11 +282,12 @@ def name_points(
     for point, name, colour in zip(to_panel.transform(places), names, colours):
         found = _places_beside(point, *size_of(axes, name))
         inside = [box for box in found if box[:2].min() >= 0.0 and box[2:].max() <= 1.0]
-        boxes = [np.vstack([box, _line_to(box, point)]) for box in inside or found]
+        inside = inside or [_pushed_inside(box) for box in found]
+        boxes = [np.vstack([box, _line_to(box, point)]) for box in inside]
         best = min(boxes, key=lambda one: (covered(one[:1], written), covered(one, taken)))
         taken, written = np.vstack([taken, best]), np.vstack([written, best[:1]])
         end = _end_of(best[0], point)
-        is_right = bool(best[0][0] > point[0])
+        is_right = bool(end[0] == best[0][0])
         line = {"arrowstyle": "-", "color": colour, "relpos": (0.0 if is_right else 1.0, 0.5)}
         place = {"xycoords": "axes fraction", "xytext": end, "va": "center"}
         look = {"color": colour, "fontweight": "bold", "ha": "left" if is_right else "right"}
@@ -324,9 +326,16 @@ def _places_beside(point: Any, width: float, height: float) -> list[Any]:
     ]
 
 
+def _pushed_inside(box: Any) -> Any:
+    """A box [4] moved sideways into the panel, as far as it is not wider."""
+    right = max(0.0, -box[0]) - max(0.0, box[2] - 1.0)
+    return box + np.array([right, 0.0, right, 0.0])
+
+
 def _end_of(box: Any, point: Any) -> Any:
     """[2] the end of a name that is nearer to its point."""
-    return np.array([box[0] if box[0] > point[0] else box[2], (box[1] + box[3]) / 2.0])
+    left, right = np.abs(box[[0, 2]] - point[0])
+    return np.array([box[0] if left < right else box[2], (box[1] + box[3]) / 2.0])
 
 
 def _line_to(box: Any, point: Any) -> Boxes:

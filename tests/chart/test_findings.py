@@ -109,7 +109,7 @@ def test_the_method_that_all_share_is_named_once_and_with_the_scene() -> None:
     assert circumstances(shared) == "NGP on city, 10 s of training on 2 CPU cores, one seed"
     beside = shared | {"protocol": {"seconds": None, "steps": 400, "at_once": 2}}
     assert circumstances(beside) == (
-        "NGP on city, 400 steps of training on 2 CPU cores, 2 runs at a time, one seed"
+        "NGP on city, 400 steps of training on one CPU core a run, one seed"
     )
     mixed = results(run("NGP + a"), run("LeCO, b", 1))
     assert circumstances(mixed) == (

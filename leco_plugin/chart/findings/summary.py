@@ -257,12 +257,14 @@ def headline(results: Mapping[str, Any], short: bool = False) -> str:
 def circumstances(results: Mapping[str, Any]) -> str:
     """Method, scene, machine, budget and seeds, in one line."""
     machine, protocol = results["machine"], results["protocol"]
-    where = (
-        f"{machine['cores']} CPU cores" if machine["device"] == "cpu" else str(machine["device"])
-    )
-    length = Protocol(protocol["seconds"], protocol["steps"]).describe()
-    if (at_once := protocol.get("at_once", 1)) > 1:
+    where, at_once = str(machine["device"]), protocol.get("at_once", 1)
+    if where == "cpu":
+        cores = max(1, machine["cores"] // at_once)
+        where = "one CPU core" if cores == 1 else f"{cores} CPU cores"
+        where += " a run" if at_once > 1 else ""
+    elif at_once > 1:
         where += f", {at_once} runs at a time"
+    length = Protocol(protocol["seconds"], protocol["steps"]).describe()
     seeds = len({run["seed"] for run in results["runs"]})
     many = "one seed" if seeds == 1 else f"{seeds} seeds: means of PSNR, medians of costs"
     method = shared_method(list(dict.fromkeys(run["name"] for run in results["runs"])))
