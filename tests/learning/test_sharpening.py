@@ -183,7 +183,7 @@ def end_a_run(mixture: Mixture, options: SharpeningConfig) -> None:
 
 @pytest.mark.parametrize(("end", "sharpened"), [(15, True), (14, False)])
 def test_it_is_sharpened_at_the_end_of_a_run_that_pays_for_it(
-    tmp_path: Path, end: int, sharpened: bool
+    tmp_path: Path, end: int, sharpened: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Frozen at step 3, a run of 15 steps is guided for 10.5 until nine tenths are over."""
     mixture = a_mixture()
@@ -204,6 +204,8 @@ def test_it_is_sharpened_at_the_end_of_a_run_that_pays_for_it(
     assert learner.watch.state.due == (soon if sharpened else 0), "its price is measured soon"
     if not sharpened:
         return
+    said = " ".join(capsys.readouterr().out.split("taught in")[1].split())
+    assert "new views may lose more" in said, "the promise is that of the new gate"
     file = Occupancy.load(tmp_path / "occupancy.safetensors")
     assert file.gate.config == GATE and file.threshold == float(mixture.threshold)
     report = file.report
