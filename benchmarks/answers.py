@@ -182,8 +182,8 @@ def _fronts(charts: Sequence[Mapping[str, Any]]) -> str:
                 its[name] += 1
     of = f"{len(charts)} scene{'s' if len(charts) > 1 else ''}"
     said = [
-        f"{who}: nothing as small keeps less space on {its['size']} of {of}, nothing learned as "
-        f"soon on {its['learning time']}."
+        f"{sentence(who)}: nothing as small keeps less space on {its['size']} of {of}, nothing "
+        f"learned as soon on {its['learning time']}."
         for who, its in counts.items()
     ]
     return " ".join(said)

@@ -28,8 +28,8 @@ Values = Sequence[float | None]
 HEAD = """On two CPU cores. *City* is the procedural city of 3 x 3 blocks, as `city` is below. Each
 figure is read from the stored result named beside it: the median over seeds, with the least and the
 most. *Yes*: every seed reaches the bar. *In the median*: the median does, some seeds do not. PSNR
-beside a rival is a difference of means with its 95% interval: ahead, level or behind. A *candidate* is a
-place on a ray at which a model that skips nothing would ask its network. The *price* is what
+beside a rival is a difference of means with its 95% interval: ahead, level or behind. A *candidate*
+is a place on a ray at which a model that skips nothing would ask its network. The *price* is what
 skipping costs held-out pixels, *lost surface mass* what it leaves out of the weight near
 surfaces."""
 
