@@ -7,10 +7,12 @@ from typing import Literal
 import pytest
 import torch
 
+from leco_plugin.models import front_to_back
 from leco_plugin.models.compute import native
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig, HMoEField
 from leco_plugin.models.front_to_back import (
+    AT_ONCE_IN_C,
     FEWEST_AT_ONCE,
     LEAST_LIGHT,
     MANY_RAYS,
@@ -37,8 +39,8 @@ from leco_plugin.samplers.packed import render_transmittance_from_density
 from leco_plugin.space import Space
 
 STEP = 0.02
-HARDLY = 1.0 / 255.0 / 30.0
-"""A thirtieth of a step of an 8-bit image."""
+HARDLY = 0.26 / 255.0
+"""Of a pixel: about a quarter of a step of an 8-bit image."""
 
 needs_compiler = pytest.mark.skipif(not native.has_native(), reason="no C compiler")
 
@@ -146,6 +148,8 @@ def test_c_asks_and_answers_as_torch_does(
     given = scene._replace(routing=Routing(float(middle), False)), rays, everything
     monkeypatch.setattr(native, "RAYS_AT_ONCE", 40)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    monkeypatch.setattr(front_to_back, "FEWEST_AT_ONCE", AT_ONCE_IN_C)  # as many samples a look
+    monkeypatch.setattr(front_to_back, "MOST_LOOKS", 1 << 10)
     assert not suits_native(*given)  # where gradients are wanted
     ours, asked = shade_front_to_back(*given)
     monkeypatch.setenv(VARIABLE, "native")
