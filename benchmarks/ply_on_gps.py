@@ -1,8 +1,9 @@
 """How far a PLY file of `leco export` is off, by GPS and by the scene's sparse points.
 
-GPS says where the photographs were taken. Receivers scatter by some metres each; the mean over the
-photographs around a place says how far the model is off there. Whether the file fits the model is
-seen from the heights of its vertices above the sparse points around them.
+GPS says where the photographs were taken. Receivers scatter by some metres each; the mean offset of
+the photographs around a place says how the model is bent there. It was fitted to the same GPS.
+Whether the file fits the model is seen from the heights of its vertices above the sparse points
+around them.
 
 python benchmarks/ply_on_gps.py SCENE PHOTOS export/kept.ply
 """
@@ -35,6 +36,8 @@ def from_gps(scene: Path, photographs: Path) -> tuple[Array, Array]:
     """Where a scene's photographs were taken [C, 3], and how far that is from GPS [C, 3], both
     metres east, north and up."""
     meta = load_json(scene / "transforms.json")
+    if "geographic_origin" not in meta:
+        raise SystemExit(f"{scene} has no geographic_origin: GPS was not used")
     origin = [meta["geographic_origin"][name] for name in ("latitude", "longitude", "altitude")]
     found = find_photographs(photographs, scene).photographs
     positions = {f"images/{each.name}": each.exif.position for each in found}
@@ -81,7 +84,9 @@ def main() -> None:
     above = np.abs(heights(vertices, sparse))
     print(f"{'metres off':52}{'median':>8}{'rms':>8}{'most':>8}{f'<= {BAR:.0f} m':>8}")
     print(line(f"{len(places)} photographs, from GPS", np.linalg.norm(off, axis=1)))
-    print(line(f"model, by {AROUND} photographs around a vertex", np.linalg.norm(local, axis=1)))
+    print(
+        line(f"mean offset of {AROUND} photographs around a vertex", np.linalg.norm(local, axis=1))
+    )
     print(line(f"{len(above)} of {len(vertices)} vertices, above sparse points", above))
 
 

@@ -134,8 +134,8 @@ def camera_places(description: Path) -> NDArray[np.float64]:
         return np.zeros((0, 3))
 
 
-WIDER = 0.05
-"""Share of its size by which an image counts as wider: its lens may bend outwards."""
+WIDER = 0.02
+"""Share of its size by which an image counts as wider: no lens is known better."""
 PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 """Camera models whose images show what lies before them."""
 
@@ -158,13 +158,25 @@ def views_of(description: Path, places: NDArray[np.float64]) -> NDArray[np.int64
                 return None
             local = (places - pose[:3, 3]) @ pose[:3, :3]
             ahead = -local[:, 2]
-            with np.errstate(divide="ignore", invalid="ignore"):
-                pixels = centre + focal * local[:, :2] * [1.0, -1.0] / ahead[:, None]
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                slopes = local[:, :2] * [1.0, -1.0] / ahead[:, None]
+                bent, folded = _bend(slopes, lens.get("k1", 0.0), lens.get("k2", 0.0))
+                pixels = centre + focal * bent
             inside = (pixels >= -WIDER * size) & (pixels <= (1.0 + WIDER) * size)
-            counts += inside.all(axis=1) & (ahead > 0.0)
+            counts += inside.all(axis=1) & (ahead > 0.0) & ~folded
     except (KeyError, TypeError, ValueError, IndexError):
         return None
     return counts
+
+
+def _bend(
+    slopes: NDArray[np.float64], k1: float, k2: float
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Slopes [N, 2] as a lens with radial distortion bends them, and whether it is folded there, so
+    that they lie further out than its image goes: [N]."""
+    squares = (slopes**2).sum(axis=1)
+    factor = 1.0 + k1 * squares + k2 * squares**2
+    return slopes * factor[:, None], 1.0 + 3.0 * k1 * squares + 5.0 * k2 * squares**2 <= 0.0
 
 
 def georeference(description: Path) -> dict[str, Any]:

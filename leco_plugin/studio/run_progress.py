@@ -181,8 +181,7 @@ class RunProgress:
         occupancy = folder / FILE_NAME
         last = self.psnr.latest if tested is None else tested
         if occupancy.exists():
-            note_end(occupancy, last, self.psnr.of_one_colour)
-            say_all(doubts(describe(Occupancy.load(occupancy))))
+            say_all(doubts(describe(at_end(occupancy, last, self.psnr.of_one_colour))))
         else:
             say_all(self.psnr.doubts(last))
         say(f"  run        {folder}")
@@ -194,14 +193,16 @@ class RunProgress:
             say(f"  {command}")
 
 
-def note_end(path: Path, field: float | None, one_colour: float) -> None:
-    """Keeps what a run has reached in the report of its occupancy, so that its inspection repeats
-    what is bad. All processes may come here; the first writes."""
-    if field is None or not is_first():
-        return
+def at_end(path: Path, field: float | None, one_colour: float) -> Occupancy:
+    """The occupancy that a run leaves, with what it has reached in its report, as far as that was
+    measured: its file is written anew, so that inspection repeats what is bad. All processes may
+    come here; the first writes."""
     occupancy = Occupancy.load(path)
-    occupancy.report = {**occupancy.report, AT_END: {FIELD: field, ONE_COLOUR: one_colour}}
-    leave_file(occupancy, path.parent)
+    if field is not None:
+        occupancy.report = {**occupancy.report, AT_END: {FIELD: field, ONE_COLOUR: one_colour}}
+        if is_first():
+            leave_file(occupancy, path.parent)
+    return occupancy
 
 
 def next_commands(folder: Path, occupancy: bool, tests: bool) -> list[str]:

@@ -19,6 +19,7 @@ from leco_plugin.chart.picture import (
     balanced,
     draw,
     name_ends,
+    name_points,
     rims,
 )
 from leco_plugin.chart.theme import DARK, LIGHT, SOURCE, Theme, fingerprint
@@ -97,6 +98,20 @@ def test_a_marker_that_others_lie_on_is_larger_than_they_are() -> None:
     under, on, beside, far = rims(axes, [(50.0, 50.0), (50.5, 50.0), (53.0, 50.0), (90.0, 50.0)])
     assert under > on == beside == far == 0.0
     assert rims(axes, []) == []
+
+
+@pytest.mark.parametrize("x", [0.4, 0.48, 0.6])
+def test_a_name_that_fits_nowhere_beside_its_point_stays_in_the_panel(x: float) -> None:
+    figure = Figure(figsize=(4, 4))
+    axes = figure.add_axes((0.1, 0.1, 0.8, 0.8))
+    axes.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0))
+    name_points(axes, [(x, 0.5)], ["a name that is wide, far"], ["black"])
+    (text,) = axes.texts
+    box = text.get_window_extent().transformed(axes.transAxes.inverted())
+    assert box.x0 > -0.01 and box.x1 < 1.01
+    assert box.width > 0.53, "else it fits beside its point"
+    anchor, other = (box.x0, box.x1) if text.get_ha() == "left" else (box.x1, box.x0)
+    assert abs(anchor - x) <= abs(other - x) + 0.01, "the line leads to the nearer end"
 
 
 def test_one_run_with_one_point_is_drawn(tmp_path: Path) -> None:

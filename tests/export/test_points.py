@@ -82,7 +82,7 @@ def scene_of(tmp_path: Path, *eyes: tuple[float, float, float], **lens: object) 
 
 
 def test_photographs_show_what_lies_before_them_within_their_images(tmp_path: Path) -> None:
-    """A camera 2 above: 2 to each side along x, 1 along y, and a twentieth of the image more."""
+    """A camera 2 above: 2 to each side along x, 1 along y, and a little more."""
     places = np.array(
         [[0, 0, 0], [1.9, 0, 0], [2.3, 0, 0], [0, 0.9, 0], [0, 1.2, 0], [0, 0, 3.0], [4, 0, 0]]
     )
@@ -94,6 +94,9 @@ def test_photographs_show_what_lies_before_them_within_their_images(tmp_path: Pa
     # the image is flipped upright: rows count downwards
     above = views_of(scene_of(tmp_path, (0.0, 0.0, 2.0), cy=0.0), places)
     assert above is not None and above.tolist() == [1, 1, 0, 0, 0, 0, 0]
+    # a barrel draws in what lies outside: 2.3 / 2 -> 1.15 (1 - 0.2 * 1.32) = 0.85
+    barrel = views_of(scene_of(tmp_path, (0.0, 0.0, 2.0), k1=-0.2), places)
+    assert barrel is not None and barrel.tolist() == [1, 1, 1, 1, 0, 0, 0]  # 4 / 2: folded
     for lens in ({"camera_model": "OPENCV_FISHEYE"}, {"fl_x": None}, {"w": "wide"}):
         assert views_of(scene_of(tmp_path, far, **lens), places) is None
 

@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 import trimesh
 from ball_occupancy import CENTRE, RADIUS, ball
+from scipy.spatial.transform import Rotation
 
 from leco_plugin.evaluation.occupancy_picture import draw
 from leco_plugin.export import export, export_folder, in_words
 from leco_plugin.occupancy import Occupancy
+from leco_plugin.scenes.city.cameras import look_at
 from leco_plugin.scenes.coloured_points import description_of_run
 from leco_plugin.scenes.whole_files import write_points
 
@@ -77,6 +79,41 @@ def test_points_have_photograph_colours_and_say_where_on_earth_they_lie(
     red = cloud.colors[clear, 0] > cloud.colors[clear, 2]
     assert (red == (offsets[clear, 0] < 0.0)).mean() > 0.98
     assert not export(file, "ply", tmp_path / "k.ply", 32)["photograph_colours"]
+
+
+@pytest.mark.parametrize("frame", ["data", "run"])
+def test_only_what_two_photographs_show_is_exported_whatever_the_frame(
+    frame: Any, tmp_path: Path
+) -> None:
+    """Two cameras look at the east of the ball from above, one by a lens of its own; the run has
+    the data turned, halved and moved."""
+    known = ball()
+    turn = Rotation.from_euler("zx", [70.0, 25.0], degrees=True).as_matrix()
+    shift = np.array([0.3, -0.2, 0.1])
+    aim = np.array(CENTRE) + RADIUS * np.array([0.8, 0.0, 0.6])
+    eyes = aim + np.array([[2.0, 0.0, 2.0], [1.0, 0.5, 2.0]])
+    report = known.report | {"cameras": eyes.tolist()}
+    report["data_frame"] = np.column_stack([0.5 * turn, shift]).tolist()
+    Occupancy(known.gate, known.space, known.threshold, report=report).save(tmp_path / "o.st")
+    frames = []
+    for eye in eyes:
+        pose = look_at(eye, aim)
+        pose = np.column_stack([turn.T @ pose[:, :3], turn.T @ (pose[:, 3] - shift) / 0.5])
+        frames.append({"file_path": "a.png", "transform_matrix": [*pose.tolist(), [0, 0, 0, 1]]})
+    frames[1]["fl_x"] = frames[1]["fl_y"] = 1.0  # which sees all of the ball
+    meta = {"w": 100, "h": 100, "fl_x": 500.0, "cx": 50.0, "cy": 50.0, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(meta))
+    options: Any = {"resolution": 48, "frame": frame}
+    export(tmp_path / "o.st", "ply", tmp_path / "all.ply", **options)
+    export(tmp_path / "o.st", "ply", tmp_path / "some.ply", data=tmp_path, **options)
+    files = (tmp_path / "all.ply", tmp_path / "some.ply")
+    every, some = (np.asarray(trimesh.load(file).vertices) for file in files)
+    if frame == "data":
+        every, some = (0.5 * part @ turn.T + shift for part in (every, some))
+    near = np.linalg.norm(every - aim, axis=1) < 0.2
+    assert 5 < near.sum() < 0.3 * len(every)
+    far = np.linalg.norm(some - aim, axis=1)
+    assert len(some) >= near.sum() and far.max() < 0.6
 
 
 def test_a_start_for_splats_is_a_copy_of_the_scene_with_kept_points(

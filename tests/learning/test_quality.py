@@ -20,7 +20,8 @@ from leco_plugin.learning.quality import (
     psnr_of_one_colour,
 )
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.studio.run_progress import note_end
+from leco_plugin.studio import run_progress
+from leco_plugin.studio.run_progress import at_end
 
 
 def test_one_colour_is_scored_as_the_mean_of_all_pixels() -> None:
@@ -74,10 +75,27 @@ def test_what_a_run_reached_is_kept_in_its_occupancy(tmp_path: Path) -> None:
     path = tmp_path / "occupancy.safetensors"
     ball().save(path)
     for last in (10.9, None):  # None: nothing was measured
-        note_end(path, last, 10.4)
+        at_end(path, last, 10.4)
         occupancy = Occupancy.load(path)
         assert "10.9 dB on unseen pixels, where one colour" in doubts(describe(occupancy))[0]
     assert occupancy.report.items() >= ball().report.items()
     assert torch.equal(occupancy.gate.head.weight, ball().gate.head.weight)
-    note_end(path, 25.3, 10.4)
+    at_end(path, 25.3, 10.4)
     assert doubts(describe(Occupancy.load(path))) == []
+
+
+def test_what_a_run_reached_is_said_where_it_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    path = tmp_path / "occupancy.safetensors"
+    ball().save(path)
+    monkeypatch.setattr(Occupancy, "save", full)
+    assert "7.0 dB" in doubts(describe(at_end(path, 7.0, 10.4)))[0]
+    monkeypatch.undo()
+    before = path.read_bytes()
+    monkeypatch.setattr(run_progress, "is_first", lambda: False)
+    assert "7.0 dB" in doubts(describe(at_end(path, 7.0, 10.4)))[0]
+    assert path.read_bytes() == before, "another process writes"

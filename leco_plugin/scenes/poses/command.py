@@ -16,6 +16,7 @@ from leco_plugin.scenes.input_error import InputError, require
 from leco_plugin.scenes.locks import LOCK, alone_in
 from leco_plugin.scenes.poses import ASKED
 from leco_plugin.scenes.poses.georeference import (
+    MODEL,
     POINTS,
     Placement,
     local_places,
@@ -25,6 +26,7 @@ from leco_plugin.scenes.poses.georeference import (
     transforms_of,
     upright,
     write_scene,
+    write_sparse_points,
 )
 from leco_plugin.scenes.poses.originals import Photograph, copy_photographs, find_photographs
 from leco_plugin.scenes.poses.reconstruction import (
@@ -42,6 +44,7 @@ from leco_plugin.scenes.whole_files import remove_parts, write_json
 
 REPORT = "poses.json"
 """In the folder of the scene: what came of what was asked for."""
+FORMAT, DESCRIPTION = 2, "transforms.json"
 GPS, BEFORE = "gps", "transforms.before_gps.json"
 """What of it says the photographs' GPS; and transforms.json as it was, where that was mended."""
 BYTES_A_PHOTOGRAPH = 1_000_000
@@ -79,6 +82,8 @@ def make_scene(
             found = copy_photographs(found, out / "images", show)
         for line in list(found.refused.values())[:NAMED]:
             print(f"left out: {line}")
+        if (out / DESCRIPTION).exists():  # it was finished, and has lost files since
+            return _restored(pycolmap, out)
         photographs = found.photographs
         exifs = [each.exif for each in photographs]
         origin, places = local_places(pycolmap, [exif.position for exif in exifs])
@@ -107,7 +112,7 @@ def _asked(photographs: list[Photograph], lens: Lens, size: int) -> dict[str, An
     """What is asked for: JSON values, those of photographs and of their GPS as digests."""
     known = [each.content for each in photographs]
     positions = [each.exif.position for each in photographs]
-    asked = {"format": 1, "photographs": len(photographs), "digest": _digest(known)}
+    asked = {"format": FORMAT, "photographs": len(photographs), "digest": _digest(known)}
     return {**asked, GPS: _digest(positions), "lens": lens, "size": size}
 
 
@@ -135,22 +140,29 @@ def _finished(out: Path, asked: dict[str, Any]) -> dict[str, Any] | None:
     other = [name for name in asked if name != GPS and found.get(name) != asked[name]]
     if other and (out / ENTERED).exists():
         what = " and ".join(sorted({"photographs" if n == "digest" else n for n in other}))
-        raise InputError(
-            f"--out {out} was begun with other {what}: give another folder, or delete it"
-        )
-    if found != asked or not _is_whole(out):
+        why = "by another version" if "format" in other else f"with other {what}"
+        raise InputError(f"--out {out} was begun {why}: give another folder, or delete it")
+    if found != asked or not all((out / name).is_file() for name in _files_of(out)):
         return None
     report: dict[str, Any] = json.loads((out / REPORT).read_text())
     return report
 
 
-def _is_whole(out: Path) -> bool:
-    """Whether all files of a finished scene are there."""
-    description = out / "transforms.json"
-    if not description.is_file():
-        return False
-    named = [frame["file_path"] for frame in load_json(description)["frames"]]
-    return all((out / name).is_file() for name in (*named, POINTS, REPORT))
+def _files_of(out: Path) -> list[str]:
+    """The files of a finished scene, as far as it says which."""
+    if not (out / DESCRIPTION).is_file():
+        return [DESCRIPTION]
+    named = [frame["file_path"] for frame in load_json(out / DESCRIPTION)["frames"]]
+    return [*named, POINTS, REPORT]
+
+
+def _restored(pycolmap: Any, out: Path) -> dict[str, Any]:
+    """The report of a finished scene whose pictures are there again, with its points; what it says
+    in transforms.json, which may have been edited, stays."""
+    if not (out / POINTS).is_file():
+        write_sparse_points(out / POINTS, *points_of(pycolmap.Reconstruction(out / MODEL)))
+    report: dict[str, Any] = json.loads((out / REPORT).read_text())
+    return report
 
 
 def _begin(out: Path, asked: dict[str, Any]) -> None:
@@ -160,10 +172,11 @@ def _begin(out: Path, asked: dict[str, Any]) -> None:
     if found is not None and found != asked:
         if (out / ENTERED).exists():
             print("EXIF has other GPS than before: photographs are placed anew")
-        if (out / "transforms.json").exists():
-            (out / "transforms.json").replace(out / BEFORE)
         shutil.rmtree(out / "images", ignore_errors=True)
         shutil.rmtree(out / MODELS, ignore_errors=True)
+    can_be_restored = (out / REPORT).is_file() and any((out / x).exists() for x in (POINTS, MODEL))
+    if (out / DESCRIPTION).exists() and (found != asked or not can_be_restored):
+        (out / DESCRIPTION).replace(out / BEFORE)
     write_json(out / ASKED, asked)
     remove_parts(out)
 
@@ -187,7 +200,8 @@ def _put_in_the_world(pycolmap: Any, model: Any, gps: dict[str, Any]) -> Placeme
     """Moves a model upright, and to metres where GPS allows it."""
     names, poses = poses_of(model)
     up = upright(poses, points_of(model)[0])
-    placement = place(pycolmap, poses[:, :, 3], np.array([gps[name] for name in names]), up)
+    known, top = np.array([gps[name] for name in names]), poses[:, :, 1].mean(axis=0)
+    placement = place(pycolmap, poses[:, :, 3], known, up, top)
     rotation = pycolmap.Rotation3d(placement.turn)
     model.transform(pycolmap.Sim3d(placement.scale, rotation, placement.shift))
     return placement

@@ -92,11 +92,14 @@ def upright(poses: Array, points: Array) -> Array:
     return np.asarray(up / max(float(np.linalg.norm(up)), 1e-9))
 
 
-def place(pycolmap: Any, centres: Array, gps: Array, up: Array) -> Placement:
+def place(
+    pycolmap: Any, centres: Array, gps: Array, up: Array, top: Array | None = None
+) -> Placement:
     """The similarity that takes a reconstruction to metres, or a rotation that sets it upright.
 
     Of camera centres [C, 3] with positions by GPS [C, 3] in metres, nan where not known; a flight
-    along one line also needs what is up [3] in the reconstruction.
+    along one line also needs what is up [3] in the reconstruction. The mean `top` [3] of the
+    photographs' top edges, if given, has a word where GPS would turn that upside down.
     """
     known = np.isfinite(gps).all(axis=1)
     if known.sum() < FEWEST:
@@ -125,12 +128,11 @@ def place(pycolmap: Any, centres: Array, gps: Array, up: Array) -> Placement:
     matrix, inlier = found["tgt_from_src"].matrix(), np.asarray(found["inlier_mask"], dtype=bool)
     scale = float(np.linalg.det(matrix[:, :3])) ** (1.0 / 3.0)
     turn = roll_upright(matrix[:, :3] / scale, gps[known][inlier], up, options.max_error)
-    if (turn @ up)[2] < 0.0 and _lie_in_a_plane(gps[known][inlier], options.max_error):
-        # positions at one height fit as well upside down
+    if _is_mirrored(turn, gps[known][inlier], up, top, options.max_error):
         return _by_direction(
             up,
-            "GPS is mirrored: it fits the poses only upside down; mend the references to north or "
-            "south, east or west in EXIF",
+            "GPS fits the poses only upside down: mend the references to north or south, east or "
+            "west in EXIF, where they are wrong",
         )
     middles = gps[known][inlier].mean(axis=0), centres[known][inlier].mean(axis=0)
     placed = Placement(scale, turn, middles[0] - scale * turn @ middles[1])
@@ -138,10 +140,15 @@ def place(pycolmap: Any, centres: Array, gps: Array, up: Array) -> Placement:
     return Placement(scale, turn, placed.shift, residuals)
 
 
-def _lie_in_a_plane(places: Array, width: float) -> bool:
-    """Whether places [N, 3] stand out of their plane by less than `width` metres, on average."""
+def _is_mirrored(turn: Array, places: Array, up: Array, top: Array | None, width: float) -> bool:
+    """Whether a turn [3, 3] to places [N, 3] by GPS, about `width` metres off, puts what is up [3]
+    down. Places in a plane fit as well from below; others, on a line or solid, say nothing of it,
+    and tops [3] that point up afterwards tell of cameras that look up."""
     away = places - places.mean(axis=0)
-    return bool(np.linalg.svd(away, compute_uv=False)[-1] < width * np.sqrt(len(places)))
+    spread = np.linalg.svd(away, compute_uv=False) / np.sqrt(len(places))
+    lies_in_a_plane = spread[1] > width > spread[2]
+    looks_up = top is not None and np.linalg.norm(top) > WANDERING and (turn @ top)[2] > 0.0
+    return bool(lies_in_a_plane and (turn @ up)[2] < -0.5 and not looks_up)
 
 
 def tolerance(spread: float) -> float:

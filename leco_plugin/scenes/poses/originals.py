@@ -10,8 +10,10 @@ import math
 import os
 import re
 import shutil
+import sys
 import warnings
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from importlib import import_module
@@ -155,9 +157,11 @@ class Photograph:
         return (height, width) if self.header.orientation >= 5 else (width, height)
 
     @property
-    def content(self) -> tuple[str, tuple[int, int], int]:
-        """What tells whether it is the same picture: name, size, and bytes without its EXIF."""
-        return self.name, self.size, self.path.stat().st_size - described_bytes(self.path)
+    def content(self) -> tuple[object, ...]:
+        """What tells whether it is the same picture: name, bytes without EXIF, and what of EXIF its
+        copy and its lens depend on."""
+        length = self.path.stat().st_size - described_bytes(self.path)
+        return self.name, length, self.size, self.header.orientation, self.exif[2:]
 
     @property
     def lens(self) -> tuple[object, ...]:
@@ -178,6 +182,9 @@ def described_bytes(path: Path) -> int:
         if file.read(2) != b"\xff\xd8":
             return 0
         while len(head := file.read(4)) == 4 and head[0] == 0xFF and head[1] != SCAN:
+            if head[1] == 0xFF:  # a marker may be filled up in front
+                file.seek(-3, os.SEEK_CUR)
+                continue
             length = int.from_bytes(head[2:], "big")
             found += 2 + length if head[1] in DESCRIPTIONS else 0
             file.seek(length - 2, os.SEEK_CUR)
@@ -219,9 +226,10 @@ def find_photographs(folder: Path, out: Path) -> Found:
             kinds = ", ".join(sorted(KINDS))
             remedy = f"give the folder that holds them; files that end in {kinds} are read"
         raise InputError(f"{folder} has {number}, and {FEWEST} or more are needed: {remedy}")
-    refused = _unreadable_heic([path for path in found if path.suffix.lower() in HEIC])
-    read = [path for path in found if path not in refused]
-    photographs = [each for path in read if (each := _or_why(_read, path, folder, refused))]
+    with suppress(ImportError):
+        import_module("pillow_heif").register_heif_opener()
+    refused: dict[Path, str] = {}
+    photographs = [each for path in found if (each := _or_why(_read, path, folder, refused))]
     _refuse_mixed_alpha(photographs)
     if len({photograph.name.lower() for photograph in photographs}) < len(photographs):
         digits = len(str(len(photographs)))
@@ -256,27 +264,27 @@ def _read(path: Path, folder: Path) -> Photograph:
     """One photograph, its pixels not decoded yet. InputError if it is of no kind that is used."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # damaged EXIF counts as not there
-        header = header_of(path)
+        header = _header(path)
         check_kind(path, header)
         with Image.open(path) as image:
             exif = read_exif(image)
     name = re.sub(r"[^\w.\-]+", "_", "_".join(path.relative_to(folder).parts))[-LONGEST:]
     photograph = Photograph(path, name, header, exif)
-    if photograph.is_copied or path.suffix.lower() in (".jpg", ".jpeg"):
+    suffix = path.suffix.lower()
+    if photograph.is_copied or (suffix in COPIED["JPEG"] and not header.transparent):
         return photograph
-    ending = ".jpg" if path.suffix.lower() in HEIC else ".png"
+    ending = ".jpg" if suffix in HEIC and not header.transparent else ".png"
     return replace(photograph, name=name if name.endswith(ending) else name + ending)
 
 
-def _unreadable_heic(files: list[Path]) -> dict[Path, str]:
-    """Lets Pillow read HEIC; where it cannot, these files, each with a line that says why."""
+def _header(path: Path) -> Header:
+    """What a file says, whatever its name ends in. InputError if it cannot be read."""
     try:
-        if files:
-            import_module("pillow_heif").register_heif_opener()
-    except ImportError:
-        why = "is HEIC: `pip install pillow-heif` reads it, or save it as JPEG"
-        return {path: f"{path} {why}" for path in files}
-    return {}
+        return header_of(path)
+    except InputError:
+        if path.suffix.lower() not in HEIC or sys.modules.get("pillow_heif"):
+            raise
+    raise InputError(f"{path} is HEIC: `pip install pillow-heif` reads it, or save it as JPEG")
 
 
 def _refuse_mixed_alpha(photographs: list[Photograph]) -> None:

@@ -115,9 +115,13 @@ def test_a_finished_scene_gets_a_picture_back_that_was_lost(
     shutil.copytree(made, lost)
     (lost / "images" / "IMG_0000.jpg").unlink()
     (lost / "sparse_pc.ply").unlink()
+    edited = (lost / "transforms.json").read_text().replace("1.0", "1.00")
+    (lost / "transforms.json").write_text(edited)
     monkeypatch.setattr(pycolmap, "incremental_mapping", None)
     assert make_scene(photos, lost, threads=1)["placed"] == 12
-    assert (lost / "images" / "IMG_0000.jpg").is_file() and (lost / "sparse_pc.ply").is_file()
+    assert (lost / "images" / "IMG_0000.jpg").is_file()
+    np.testing.assert_allclose(read_ply(lost / "sparse_pc.ply"), read_ply(made / "sparse_pc.ply"))
+    assert (lost / "transforms.json").read_text() == edited
 
 
 @pytest.mark.slow

@@ -177,8 +177,15 @@ def test_mirrored_gps_does_not_turn_a_survey_upside_down(axis: int) -> None:
     gps = places.copy()
     gps[:, axis] *= -1.0
     placed = place(pycolmap, centres, gps, up)
-    assert placed.residuals is None and placed.reason.startswith("GPS is mirrored: ")
+    assert placed.residuals is None and placed.reason.startswith("GPS fits the poses only upside")
     np.testing.assert_allclose(placed.turn @ up, [0.0, 0.0, 1.0], atol=1e-9)
+    # right GPS on a line, or of cameras that look up, says nothing of what seemed to be up
+    places[:, 1] *= 0.02
+    assert place(pycolmap, away(places)[0], places, -away(places)[1]).residuals is not None
+    places[:, 1] *= 50.0
+    turned, up = away(places)
+    assert place(pycolmap, turned, places, -up).residuals is None
+    assert place(pycolmap, turned, places, -up, 0.6 * up).residuals is not None
     # places in all three directions leave no doubt: what seemed to be up is wrong
     solid = np.random.default_rng(6).normal(size=places.shape) * 40.0
     placed = place(pycolmap, *away(solid)[:1], solid, -away(solid)[1])

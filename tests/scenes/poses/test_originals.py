@@ -211,6 +211,44 @@ def test_heic_without_its_reader_is_left_out_by_name(
         find_photographs(folder, tmp_path / "out")
 
 
+def test_jpeg_named_heic_is_read_and_alpha_named_jpg_keeps_it(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pillow_heif", None)
+    (folder / "IMG_0.jpg").rename(folder / "IMG_0.HEIC")
+    found = copies(folder, tmp_path / "out")
+    assert found["IMG_0.HEIC.jpg"].format == "JPEG"
+    clear = tmp_path / "clear"
+    clear.mkdir()
+    for number in range(3):
+        Image.new("RGBA", (32, 24), (number, 2, 3, 4)).save(clear / f"{number}.jpg", "PNG")
+    copied = copies(clear, tmp_path / "two")
+    assert {name: image.mode for name, image in copied.items()} == dict.fromkeys(
+        ("0.jpg.png", "1.jpg.png", "2.jpg.png"), "RGBA"
+    )
+
+
+def test_what_a_copy_or_its_lens_depends_on_makes_another_picture(folder: Path) -> None:
+    """Other GPS does not, nor a comment, nor fill bytes before a marker."""
+
+    def content() -> tuple[object, ...]:
+        return find_photographs(folder, folder / "out").photographs[0].content
+
+    path = folder / "IMG_0.jpg"
+    plain, before = path.read_bytes(), content()
+    end = 4 + int.from_bytes(plain[4:6], "big")
+    filled = plain[:end] + b"\xff\xfe\x00\x06note" + b"\xff" * 3 + plain[end:]
+    path.write_bytes(filled)
+    name, length, *rest = content()
+    assert (name, rest) == (before[0], list(before[2:]))
+    assert length == before[1] + 3  # type: ignore[operator]
+    with Image.open(path) as image:
+        exif = image.getexif()
+        exif[0x0112] = 3
+        image.save(path, quality=95, exif=exif)
+    assert content()[3] == 3
+
+
 @pytest.mark.parametrize("kind", ["WEBP", "PNG", "TIFF"])
 def test_what_a_name_says_wrongly_is_written_anew_as_its_name_says(
     kind: str, folder: Path, tmp_path: Path
@@ -223,10 +261,12 @@ def test_what_a_name_says_wrongly_is_written_anew_as_its_name_says(
 def test_a_picture_larger_than_pillow_opens_is_named_with_its_reason(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 32 * 24)
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 32 * 24 - 1)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert len(copies(folder, tmp_path / "out")) == 3
+        found = find_photographs(folder, tmp_path / "out")
+        copied = copy_photographs(found, tmp_path / "out" / "images", lambda share: None)
+    assert len(copied.photographs) == 3
     Image.new("RGB", (64, 25)).save(folder / "IMG_7.jpg")
     (why,) = find_photographs(folder, tmp_path / "out").refused.values()
     assert "IMG_7.jpg has more than the 0 megapixels that Pillow opens: make it smaller" in why
