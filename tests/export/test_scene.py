@@ -100,8 +100,15 @@ def test_only_what_two_photographs_show_is_exported_whatever_the_frame(
         pose = look_at(eye, aim)
         pose = np.column_stack([turn.T @ pose[:, :3], turn.T @ (pose[:, 3] - shift) / 0.5])
         frames.append({"file_path": "a.png", "transform_matrix": [*pose.tolist(), [0, 0, 0, 1]]})
-    frames[1]["fl_x"] = frames[1]["fl_y"] = 1.0  # which sees all of the ball
-    meta = {"w": 100, "h": 100, "fl_x": 500.0, "cx": 50.0, "cy": 50.0, "frames": frames}
+    frames[0]["fl_x"] = 500.0
+    meta = {
+        "w": 100,
+        "h": 100,
+        "fl_x": 1.0,  # which sees all of the ball
+        "cx": 50.0,
+        "cy": 50.0,
+        "frames": frames,
+    }
     (tmp_path / "transforms.json").write_text(json.dumps(meta))
     options: Any = {"resolution": 48, "frame": frame}
     export(tmp_path / "o.st", "ply", tmp_path / "all.ply", **options)
