@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from leco_plugin.log import say
-from leco_plugin.scenes.frames import APPLIED, inverse, moved, parsed_frame
+from leco_plugin.scenes.frames import APPLIED, applied_in, inverse, moved, parsed_frame
 from leco_plugin.scenes.scene_file import load_json
 
 FAR = 100.0
@@ -82,8 +82,7 @@ class ReadsNear(DataParser):
         outputs: DataparserOutputs = near(self, split, **kwargs)
         meta = self._meta or {}
         if isinstance(self, Nerfstudio):
-            scale = float(meta.get("applied_scale", 1.0))
-            outputs.metadata[APPLIED] = meta.get("applied_transform"), scale
+            outputs.metadata[APPLIED] = applied_in(meta, self.config.data)
         if self.shift is None or not self.shift.any():
             return outputs
         transform = torch.as_tensor(outputs.dataparser_transform).double()[:3].clone()

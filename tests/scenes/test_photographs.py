@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ import trimesh
 from PIL import Image
 from scene_files import change, refused
 
-from leco_plugin.scenes.frames import METRES_PER_UNIT, moved, parsed_frame
+from leco_plugin.scenes.frames import METRES_PER_UNIT, data_frame_of, inverse, moved, parsed_frame
 from leco_plugin.scenes.photographs import (
     POINTS,
     LecoPhotographsDataParserConfig,
@@ -175,6 +176,27 @@ def test_sparse_points_follow_the_cameras_into_model_coordinates(
     distances = torch.cdist(outputs.cameras.camera_to_worlds[:, :, 3], outputs.metadata[POINTS])
     assert len(outputs.metadata[POINTS]) == 9
     assert float(distances.amin(dim=1).max()) < 1e-5
+
+
+def test_a_held_out_stretch_leaves_the_way_back_to_the_file_as_it_is(scene: Path) -> None:
+    def add(meta: dict[str, Any]) -> None:
+        for number, frame in enumerate(meta["frames"][:3]):
+            name = f"images/more{number}{Path(frame['file_path']).suffix}"
+            shutil.copyfile(scene / frame["file_path"], scene / name)
+            moved_on = np.array(frame["transform_matrix"]) + 0.5 * np.eye(4, 4, 3)
+            meta["frames"].append({"file_path": name, "transform_matrix": moved_on.tolist()})
+
+    change(scene, add)
+    earlier(scene)
+    config = LecoPhotographsDataParserConfig(data=scene, held_out="stretch")
+    outputs = config.setup().get_dataparser_outputs("train")
+    frame = data_frame_of(SimpleNamespace(train_dataparser_outputs=outputs))
+    back = inverse(torch.tensor(frame, dtype=torch.float64))
+    found = moved(outputs.cameras.camera_to_worlds[:, :, 3].double(), back).numpy()
+    frames = check_scene(scene)["frames"]
+    places = {Path(one["file_path"]).name: one["transform_matrix"] for one in frames}
+    for path, place in zip(outputs.image_filenames, found):
+        np.testing.assert_allclose(place, np.array(places[path.name])[:3, 3], atol=1e-4)
 
 
 @pytest.mark.parametrize(
