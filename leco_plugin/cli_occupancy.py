@@ -57,6 +57,7 @@ def inspect(
     for name, value in facts["report"].items():
         if isinstance(value, (int, float, str)) and name not in ("params", "threshold"):
             print(f"{name.replace('_', ' ')}: {_said(value)}")
+    print("docs/file-format.md says what each of these is")
     if picture is not None:
         _draw(occupancy, picture, scene_of(occupancy, file, data))
     if history is not None:
@@ -144,7 +145,8 @@ def _export_in_words(out: Path, facts: dict[str, Any], frame: str | None) -> lis
         lines.append(f"its origin on earth: {facts['geographic_origin']}")
     if splats:
         data = shlex.quote(str(out))
-        lines.append(f"start from it with: ns-train splatfacto --data {data} leco-photographs")
+        command = f"ns-train splatfacto --data {data} leco-photographs"
+        lines.append(f"start from it with: {command} (on a GPU)")
     if frame != facts["frame"] == "run":
         lines.append("the file does not say how its run moved the data: learn it anew to know")
     return lines

@@ -352,7 +352,7 @@ def export_folder(
             lambda: exported("splat-init", splats.name),
             lambda facts: (
                 f"{facts['points']:,} points in splats.ply, to start splats from: "
-                f"ns-train splatfacto --data {shlex.quote(str(splats))} leco-photographs"
+                f"ns-train splatfacto --data {shlex.quote(str(splats))} leco-photographs (on a GPU)"
             ),
         ),
         part(

@@ -219,7 +219,7 @@ def test_ctrl_c_ends_a_run_after_its_step_and_says_how_to_go_on(runs: Runs) -> N
     folder = runs.folder("run") / "nerfstudio_models"
     assert last_line.startswith("step 7: stopped by Ctrl-C; the last good checkpoint is")
     assert last_line.endswith(
-        f"--load-dir {folder} --max-num-iterations {STEPS - 8} goes on from there"
+        f"the same command with --load-dir {folder} --max-num-iterations {STEPS - 8} goes on"
     )
     assert "Traceback" not in said and "stopping after this step" in said
     checkpoint = newest(runs.folder("run"))

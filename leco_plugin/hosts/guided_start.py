@@ -200,7 +200,7 @@ class GuidedStart:
         seen = survey(manager, learning.bounds, learning.near, learning.far)
         if seen.rounded:
             say(seen.rounded)
-        say(f"guided by an occupancy that keeps {share:.1%} along the rays of these cameras")
+        say(f"guided by an occupancy that keeps {share:.1%} of the length of these cameras' rays")
         say_all(doubts(describe(occupancy)))
         return along
 

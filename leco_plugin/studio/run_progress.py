@@ -137,6 +137,8 @@ class RunProgress:
         trainer.callbacks.append(TrainingCallback([where.AFTER_TRAIN_ITERATION], self.after_step))
         trainer.callbacks.append(TrainingCallback([where.AFTER_TRAIN], self.finish))
         folder, viewer = trainer.base_dir, trainer.viewer_state
+        if start := getattr(trainer, "_start_step", 0):
+            say(f"goes on at step {start}")
         say(f"run: {folder}" + (f", details in {LOG}" if on_screen() else ""))
         say_all(getattr(viewer, "viewer_info", None) or ())
 

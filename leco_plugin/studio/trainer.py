@@ -172,7 +172,7 @@ class AtomicTrainer(Trainer):
         if saved := self._saved():  # a step in doubt is not saved: it goes on from the one before
             done, end = step_of(saved[-1]) + 1, end_of(self)
             steps = f"--max-num-iterations {iterations_until(end, done)}"
-            resume = f"--load-dir {self.checkpoint_dir} {steps} goes on from there"
+            resume = f"the same command with --load-dir {self.checkpoint_dir} {steps} goes on"
             parts += [resume] if done < end else []
         raise TrainingStopped("; ".join(parts))
 
