@@ -199,9 +199,11 @@ def _draw_front(axes: Any, panel: Panel, theme: Theme) -> None:
 def draw_curves(axes: Any, lines: Sequence[Line], theme: Theme, small: bool = False) -> None:
     """Mean PSNR of each line against seconds of training, its seeds as a band, and the best so
     far of all."""
+    ends = []
     for i, line in enumerate(lines):
         look = style(i, theme)
         seconds, mean, low, high = line.curve()
+        ends.append((seconds[-1], mean[-1]))
         dashes = "-" if line.learned else (0, (5, 2))
         width = 1.6 if small else 2.6
         axes.plot(seconds, mean, linestyle=dashes, linewidth=width, color=look["color"])
@@ -211,7 +213,6 @@ def draw_curves(axes: Any, lines: Sequence[Line], theme: Theme, small: bool = Fa
     plain(axes, theme)
     axes.set_xlim(0.0, 1.02 * max(run["train_seconds"] for line in lines for run in line.runs))
     axes.margins(y=0.05)
-    ends = [(times[-1], means[-1]) for times, means, *_ in (line.curve() for line in lines)]
     for i, (end, rim) in enumerate(zip(ends, rims(axes, ends))):
         axes.plot(*end, markersize=rim + (6 if small else 9), **style(i, theme))
 

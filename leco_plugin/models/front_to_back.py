@@ -29,9 +29,9 @@ from leco_plugin.models.rendering import (
 )
 from leco_plugin.samplers.packed import pack_info
 
-LEAST_LIGHT = 1e-3
-"""Transmittance below which a ray is given up: what lies behind changes a pixel by no more than
-a quarter of a step of an 8-bit image, or little more."""
+LEAST_LIGHT = 1e-4
+"""Transmittance below which a ray is given up: what lies behind changes a pixel by less than a
+thirtieth of a step of an 8-bit image."""
 
 FEWEST_AT_ONCE, MOST_LOOKS = 8, 16
 """In torch, samples of a ray between two looks at its transmittance, and looks at the longest."""

@@ -107,14 +107,19 @@ def test_a_finished_scene_is_left_as_it_is(
         make_scene(photos, made, "fisheye", 800)
 
 
+def copied_without(made: Path, out: Path, *names: str) -> Path:
+    """A copy of a scene that lacks some of its files."""
+    shutil.copytree(made, out)
+    for name in names:
+        (out / name).unlink()
+    return out
+
+
 @pytest.mark.slow
 def test_a_finished_scene_gets_a_picture_back_that_was_lost(
     made: Path, photos: Path, tmp_path: Path, pycolmap: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lost = tmp_path / "lost"
-    shutil.copytree(made, lost)
-    (lost / "images" / "IMG_0000.jpg").unlink()
-    (lost / "sparse_pc.ply").unlink()
+    lost = copied_without(made, tmp_path / "lost", "images/IMG_0000.jpg", "sparse_pc.ply")
     edited = (lost / "transforms.json").read_text().replace("1.0", "1.00")
     (lost / "transforms.json").write_text(edited)
     monkeypatch.setattr(pycolmap, "incremental_mapping", None)
@@ -144,11 +149,8 @@ def test_a_run_that_was_killed_goes_on_with_what_is_missing(
     made: Path, photos: Path, tmp_path: Path, pycolmap: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a run that was killed while it mapped: features and matches are not made again."""
-    killed = tmp_path / "killed"
-    shutil.copytree(made, killed)
-    for name in ("transforms.json", "poses.json", "colmap/models/all"):
-        (killed / name).unlink()
-    (killed / "images" / "IMG_0000.jpg").unlink()
+    gone = ("transforms.json", "poses.json", "colmap/models/all", "images/IMG_0000.jpg")
+    killed = copied_without(made, tmp_path / "killed", *gone)
     (killed / "images" / ".IMG_0001.jpg.7-7.part").touch()
     monkeypatch.setattr(pycolmap, "extract_features", None)
     matched = pycolmap.Database.open(killed / "colmap/database.db").num_matched_image_pairs()
