@@ -154,11 +154,16 @@ def check(name: Annotated[str, tyro.conf.Positional], json: Path | None = None) 
     """
     check_json(json)
     from leco_plugin.conformance.cases import check as verdicts_on
+    from leco_plugin.log import kept_back
 
     verdicts = []
-    for verdict in verdicts_on(name):
-        print(verdict.line(), flush=True)
-        verdicts.append(verdict)
+    with kept_back() as said:
+        for verdict in verdicts_on(name):
+            print(verdict.line(), flush=True)
+            verdicts.append(verdict)
+            for line in said if not verdict.passed else ():
+                print(f"      said before: {line}")
+            said.clear()
     rows = [verdict.to_dict() for verdict in verdicts]
     write_json(json, {"format": 1, "name": name, "verdicts": rows})
     failed = sum(not verdict.passed for verdict in verdicts)

@@ -129,10 +129,10 @@ def draw_chart(report: dict[str, Any], path: Path, theme: Theme = LIGHT) -> Path
     with themed(theme):
         figure = new_figure((8, 4.4), theme.page)
         figure.suptitle(title, fontsize=14, fontweight="bold", x=0.01, ha="left")
-        axes = figure.add_axes((0.11, 0.14, 0.55, 0.7))
-        draw_curves(axes, lines, theme)
         scene = f"Procedural city of {blocks} x {blocks} blocks, {where}, one seed: no verdict"
-        axes.set_title(scene, fontsize=11.5, loc="left")
+        figure.text(0.01, 0.93, scene, va="top", fontsize=11.5)
+        axes = figure.add_axes((0.11, 0.14, 0.55, 0.68))
+        draw_curves(axes, lines, theme)
         axes.set_xlabel("seconds of training")
         axes.set_ylabel("PSNR on unseen photographs, dB", fontsize=11)
         name_ends(axes, lines, theme, apart=0.16)

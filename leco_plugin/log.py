@@ -28,6 +28,8 @@ OF_A_DEVICE = ("leco_plugin.samplers.kernels.fused", "leco_plugin.models.compute
 
 _details: TextIO | None = None
 """The log file of the run that goes on."""
+_kept_back: list[str] | None = None
+"""Lines that whoever keeps them back may still show."""
 
 
 @contextmanager
@@ -39,6 +41,18 @@ def details_in(file: TextIO) -> Iterator[None]:
         yield
     finally:
         _details = before
+
+
+@contextmanager
+def kept_back() -> Iterator[list[str]]:
+    """While this lasts, yields what would be said by `say`, `note` and the package's loggers."""
+    global _kept_back
+    say_what_is_logged()
+    before, _kept_back = _kept_back, []
+    try:
+        yield _kept_back
+    finally:
+        _kept_back = before
 
 
 def on_screen() -> bool:
@@ -70,7 +84,7 @@ def say(line: str) -> None:
 
     It is shown as it is: brackets and colons in the name of a file mean nothing.
     """
-    if is_first() and _details is not None:
+    if is_first() and _details is not None and _kept_back is None:
         put(line)
     else:
         note(line, offset=3)
@@ -90,7 +104,9 @@ def note(line: str, offset: int = 2) -> None:
     """
     if not is_first():
         return
-    if _details is None:
+    if _kept_back is not None:
+        _kept_back.append(line)
+    elif _details is None:
         console().log(f"[leco] {line}", markup=False, emoji=False, _stack_offset=offset)
     else:
         _write(line)

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -122,6 +123,23 @@ def test_check_prints_a_line_for_each_rule(
     facts = json.loads((tmp_path / "verdicts.json").read_text())
     assert facts["format"] == 1 and facts["name"] == "dense"
     assert [verdict["passed"] for verdict in facts["verdicts"]] == [True] * 3
+
+
+@pytest.mark.parametrize("passed", [True, False])
+def test_what_is_said_while_a_rule_is_checked_is_shown_where_it_is_broken(
+    passed: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from leco_plugin.conformance import cases, rules
+    from leco_plugin.log import say
+
+    def verdicts(name: str) -> Iterator[rules.Verdict]:
+        say("no ray comes near")
+        error = None if passed else rules.Broken("wrong")
+        yield rules.Verdict(rules.RULES[0], name, "estimator", error)
+
+    monkeypatch.setattr(cases, "check", verdicts)
+    assert run("check", "dense") == (0 if passed else 1)
+    assert ("no ray comes near" in capsys.readouterr().out) != passed
 
 
 def test_check_ends_with_status_1_when_a_rule_is_broken(

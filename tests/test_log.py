@@ -102,3 +102,15 @@ def test_a_process_that_is_not_the_first_only_warns(
     said = capsys.readouterr().out
     assert "[leco] process 3: the fused gate does not run" in said
     assert "answers" not in said and "cell cache" not in said
+
+
+def test_what_is_kept_back_is_not_on_the_screen(
+    logged: logging.Logger, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with log.kept_back() as kept:
+        log.say("said")
+        log.note("noted")
+        logged.warning("warned of")
+    assert kept == ["said", "noted", "warned of"] and not capsys.readouterr().out
+    log.say("said again")
+    assert "said again" in capsys.readouterr().out and len(kept) == 3

@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from leco_plugin.chart.contender import (
+    LEARNED,
+    SMALL,
     Contender,
     Job,
     Protocol,
@@ -34,10 +36,11 @@ from leco_plugin.chart.runner import (
 from leco_plugin.chart.table import table
 from leco_plugin.evaluation.report import describe_code, describe_machine
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.photographs import describe_held_out, describe_scene
+from leco_plugin.scenes.photographs import describe_held_out, describe_scene, megapixels_of
 from leco_plugin.scenes.whole_files import write_json
 
 Say = Callable[[str], None]
+NOTHING_SKIPPED = "; no occupancy was learned in this time, so that nothing was skipped"
 
 
 def jobs_of(contenders: Sequence[Contender], seeds: Sequence[int]) -> list[Job]:
@@ -132,14 +135,17 @@ class Chart:
             return f"{title}: failed: {failure}"
         code = run.pop("code", None) or describe_code()
         self.folder.store(job, run, made={**self._made(), **code})
+        learns = job.contender.sampler.startswith(LEARNED)
+        late = learns and "freeze_seconds" in run and run["freeze_seconds"] is None
         return (
             f"{title}: {run['psnr']:.2f} dB after {run['train_seconds']:.0f} s, "
-            f"{run['render_seconds_per_image']:.2f} s an image"
+            f"{run['render_seconds_per_image']:.2f} s an image" + (NOTHING_SKIPPED if late else "")
         )
 
     def forecast(self, todo: Sequence[Job]) -> str:
         """How many runs are to be made, and about how long that takes."""
-        about = forecast((job.contender for job in todo), self.protocol)
+        megapixels = megapixels_of(self.data) or SMALL
+        about = forecast((job.contender for job in todo), self.protocol, megapixels)
         runs = f"{_counted(len(todo), 'run')} of {self.protocol.describe()}"
         beside = f", {self.protocol.at_once} at a time" if self.protocol.at_once > 1 else ""
         stored = len(self.jobs) - len(todo)

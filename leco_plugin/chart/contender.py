@@ -260,33 +260,48 @@ class Cores:
     """More of that in a run that skips nothing."""
     grids: float
     """Making grids up to 512^3 from the field of a run, and teaching small gates by it."""
+    megapixel: float
+    """Rendering a million pixels by a run that skips; one that does not takes `UNGUIDED` times as
+    long."""
 
 
-FAST = Cores(step=0.15, overhead=30.0, unguided=25.0, grids=140.0)
+SMALL, UNGUIDED = 480 * 360 / 1e6, 5.0
+"""Megapixels of a test image whose rendering is in `Cores.overhead`; see `Cores.megapixel`."""
+FAST = Cores(step=0.15, overhead=30.0, unguided=25.0, grids=140.0, megapixel=13.0)
 """An AMD EPYC with AVX-512 bfloat16; cities, and surveys of 480 x 360 pixels."""
-SLOW = Cores(step=0.45, overhead=45.0, unguided=60.0, grids=280.0)
+SLOW = Cores(step=0.45, overhead=45.0, unguided=60.0, grids=280.0, megapixel=40.0)
 """A Xeon with it at a third of that speed, whose caches are shared with other machines."""
 
 
-def run_seconds(contender: Contender, protocol: Protocol, cores: Cores) -> float:
-    """Forecast of one run, from the start of its process to the end."""
+def run_seconds(
+    contender: Contender, protocol: Protocol, cores: Cores, megapixels: float = SMALL
+) -> float:
+    """Forecast of one run, from the start of its process to the end; its test images have so many
+    million pixels."""
     steps = None if protocol.steps is None else protocol.steps * cores.step
     seconds = min(end for end in (protocol.seconds, steps) if end is not None) + cores.overhead
+    larger = max(0.0, megapixels - SMALL) * protocol.images * cores.megapixel
     if contender.sampler in (DENSE, OWN_SAMPLER):
         seconds += cores.unguided
-    return seconds + (cores.grids if contender.grids else 0.0)
+        larger *= UNGUIDED
+    return seconds + larger + (cores.grids if contender.grids else 0.0)
 
 
-def forecast_minutes(contenders: Iterable[Contender], protocol: Protocol, cores: Cores) -> float:
+def forecast_minutes(
+    contenders: Iterable[Contender], protocol: Protocol, cores: Cores, megapixels: float = SMALL
+) -> float:
     """Forecast of one run of each contender, as many at a time as the protocol says."""
-    seconds = sum(run_seconds(one, protocol, cores) for one in contenders)
+    seconds = sum(run_seconds(one, protocol, cores, megapixels) for one in contenders)
     return seconds / protocol.at_once / 60.0
 
 
-def forecast(contenders: Iterable[Contender], protocol: Protocol) -> str:
+def forecast(contenders: Iterable[Contender], protocol: Protocol, megapixels: float = SMALL) -> str:
     """The same in words, for fast cores and for slow ones."""
     given = list(contenders)
-    fast, slow = (max(1, round(forecast_minutes(given, protocol, one))) for one in (FAST, SLOW))
+    fast, slow = (
+        max(1, round(forecast_minutes(given, protocol, cores, megapixels)))
+        for cores in (FAST, SLOW)
+    )
     if fast == slow:
         return f"about {fast} minute{'s' if fast > 1 else ''} on two CPU cores"
     return f"about {fast} to {slow} minutes on two CPU cores, by their speed"

@@ -188,6 +188,13 @@ def describe_scene(data: Path) -> dict[str, Any]:
     return {"name": name, "images": len(meta["frames"]), "digest": digest[:16]}
 
 
+def megapixels_of(data: Path) -> float | None:
+    """Million pixels of a scene's first photograph; None where its file does not say them."""
+    meta = check_scene(data)
+    width, height = (meta["frames"][0].get(side, meta.get(side)) for side in "wh")
+    return None if width is None or height is None else float(width) * float(height) / 1e6
+
+
 Array = NDArray[np.float64]
 LEAST, WANTED, MOST = 1 / 12, 1 / 8, 1 / 4
 """Shares of all cameras that a stretch may have, and the one that it has where nothing decides."""

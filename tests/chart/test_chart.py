@@ -106,6 +106,21 @@ def test_after_a_kill_only_what_is_missing_is_made(
     assert results["runs"] == whole["runs"]
 
 
+def test_a_run_that_was_too_short_to_learn_says_so(tiny_scene: Path, tmp_path: Path) -> None:
+    def runner(job: Job, show: Callable[[float], None]) -> dict[str, Any]:
+        frozen = 4.0 if job.seed else None
+        sampler = job.contender.sampler
+        return chart_results.run("a", job.seed, sampler=sampler, freeze_seconds=frozen)
+
+    said: list[str] = []
+    given = [Contender("a", "leco-ngp", sampler) for sampler in ("learned-occupancy", "own")]
+    chart(tiny_scene, tmp_path, contenders=given).make(runner, say=said.append)
+    assert [line.endswith("so that nothing was skipped") for line in said] == [
+        *(False, True),  # the forecast; with seed 0 none was learned
+        *(False, False, False),
+    ]
+
+
 def test_a_crash_is_a_row_and_the_others_finish(tiny_scene: Path, tmp_path: Path) -> None:
     said: list[str] = []
     made = chart(tiny_scene, tmp_path)

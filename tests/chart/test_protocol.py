@@ -13,6 +13,8 @@ from leco_plugin.chart.contender import (
     FAST,
     LEARN_SHARE,
     SLOW,
+    SMALL,
+    UNGUIDED,
     Contender,
     Cores,
     Protocol,
@@ -88,6 +90,20 @@ def test_two_runs_at_a_time_take_half_as_long() -> None:
     minutes = forecast_minutes([GUIDED, DENSE], alone, FAST)
     assert minutes == pytest.approx((130.0 + 155.0) / 60.0)
     assert forecast_minutes([GUIDED, DENSE], beside, FAST) == pytest.approx(minutes / 2)
+
+
+def test_large_test_images_take_longer_and_longest_where_nothing_is_skipped() -> None:
+    protocol = Protocol(20.0, images=3)
+    small, large = (
+        [run_seconds(run, protocol, FAST, size) for run in (GUIDED, DENSE)]
+        for size in (SMALL, SMALL + 1.5)
+    )
+    assert run_seconds(GUIDED, protocol, FAST) == small[0]
+    assert run_seconds(GUIDED, protocol, FAST, SMALL / 4) == small[0]
+    assert large[0] - small[0] == pytest.approx(3 * 1.5 * FAST.megapixel)
+    assert large[1] - small[1] == pytest.approx(UNGUIDED * 3 * 1.5 * FAST.megapixel)
+    said = forecast([DENSE], protocol, 2.0)
+    assert said == "about 7 to 20 minutes on two CPU cores, by their speed"
 
 
 def test_what_is_said_holds_for_fast_cores_and_for_slow_ones() -> None:
