@@ -31,9 +31,11 @@ commands are below; a chart marked (*) was made before a mend that is named ther
 """
 KEPT = """Volume kept, of what rays reach, where each loses 0.1% of the surface mass, and the size
 of the occupancy: less is better in both, and what is on the front is so in the median over seeds.
-Grids, and a small gate of each kind, are made from the field that learned with our gate; more sizes
-of all are [elsewhere](measurements.md#how-much-a-scene-needs-gates-and-grids-at-equal-loss). Sizes
-are those of the numbers in bfloat16, and of a grid's cells in bits.
+Grids, and a small gate of each kind, are made from the field that learned with our gate. A *grid* is
+filled with densities, as hosts fill theirs; a *taught grid* has the lesson that small gates have.
+*Sparse points* keep what is near one of the scene's. More sizes of all are
+[elsewhere](measurements.md#how-much-a-scene-needs-gates-and-grids-at-equal-loss). Sizes are those
+of numbers in bfloat16, and of grids as octrees.
 """
 LEARNED = """Space that each gate keeps, of what rays reach, where it loses 0.1% of the surface, and
 PSNR after equally many steps. A gate that was frozen with the last of them has guided nothing.

@@ -287,4 +287,5 @@ def run_for(record: Mapping[str, Any], job: Job) -> dict[str, Any]:
         facts["left_out"] = [size for size in facts["left_out"] if size in asked]
         if not job.contender.taught:
             facts.pop("taught", None)
+            facts.pop("others", None)
     return run

@@ -48,7 +48,7 @@ TOP, LINE_HEIGHT, SMALL_LINE_HEIGHT = 0.985, 0.04, 0.0235
 COSTS_BELOW = "What it costs. Up and left is better; nothing is better in both than the grey line."
 PSNR_BELOW = "PSNR on unseen photographs, dB, against what it costs. Up and left is better:"
 KEPT_SPACE = f"Space that must be sampled where each loses {LOST_SURFACE_MASS:.1%} of the surface"
-SIZE = "size, kB: numbers in bfloat16, cells of grids in bits"
+SIZE = "size, kB: numbers in bfloat16, grids as octrees"
 
 
 def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:

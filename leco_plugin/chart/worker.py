@@ -7,6 +7,7 @@ import math
 import shutil
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +26,10 @@ SMALL_GATES = {
     "K-planes": "k-planes-32-4-1",
 }
 """A gate of each kind that keeps little for its bytes in `leco capacity`: 5 to 27 kB."""
+TAUGHT_GRIDS = (32, 64, 128, 256)
+"""Cells along an axis of grids that are taught as small gates are."""
+SPARSE, BYTES_A_POINT = "sparse points", 6
+"""Its three numbers in half precision."""
 
 
 def run_job(
@@ -129,36 +134,57 @@ def compare_at_freezing(model: Any, datamanager: Any, contender: Contender) -> d
 
     Returns:
         As `at_equal_loss`. Where the contender asks for small gates, `taught` holds for each of
-        `SMALL_GATES` its `name`, its `bytes`, the `seconds` of teaching it, and what it keeps.
+        `SMALL_GATES` its `name`, its `bytes`, the `seconds` of teaching it, and what it keeps; and
+        `others` holds the same of grids that had the same lesson, and of the scene's sparse points:
+        what lies near one is kept. `learned_first` says whether the field is needed.
     Raises:
         ValueError: held-out rays see no surface.
     """
-    from leco_plugin.evaluation.equal_loss import at_equal_loss
+    from leco_plugin.evaluation.equal_loss import at_equal_loss, mapped_box, near_points
 
     if not contender.taught:
         return at_equal_loss(model.mixture, datamanager, contender.grids)
-    from leco_plugin.capacity.measuring import lesson_of, taught_score
+    from leco_plugin.capacity.measuring import lesson_of, taught_grid, taught_score
     from leco_plugin.capacity.search import gates
     from leco_plugin.capacity.sources import Source
     from leco_plugin.evaluation.clock import seconds_now
     from leco_plugin.learning.dense import evaluating
+    from leco_plugin.scenes.survey import sparse_points
 
     known = {gate.key: gate for gate in gates()}
     started = seconds_now()
     with evaluating(model):
         lesson = lesson_of(Source(datamanager, model), model.config.gate_loss)
     of_lesson = seconds_now() - started
-    scores, rows = {}, []
-    for name, key in SMALL_GATES.items():
-        gate = known[key].gate
-        assert gate is not None
+    scores: dict[str, Any] = {}
+    rows: dict[str, list[dict[str, Any]]] = {"taught": [], "others": []}
+
+    def add(kind: str, name: str, make: Callable[[], Any], before: float, **facts: Any) -> None:
         started = seconds_now()
-        scores[name] = taught_score(gate, lesson, model.mixture.precision)
-        seconds = round(of_lesson + seconds_now() - started, 2)
-        rows.append({"name": name, "bytes": known[key].bytes, "seconds": seconds})
+        scores[name] = make()
+        seconds = round(before + seconds_now() - started, 2)
+        rows[kind].append({"name": name, "seconds": seconds, **facts})
+
+    for name, key in SMALL_GATES.items():
+        config = known[key].gate
+        assert config is not None
+        teach = partial(taught_score, config, lesson, model.mixture.precision)
+        add("taught", name, teach, of_lesson, bytes=known[key].bytes)
+    box = mapped_box(model.mixture)
+    for cells in TAUGHT_GRIDS:
+        fill = partial(taught_grid, lesson, box, cells)
+        add("others", f"taught grid {cells}³", fill, of_lesson, learned_first=True)
+    points = sparse_points(datamanager.train_dataset)
+    if points is not None:
+        near = partial(near_points, model.mixture.region.space.map(points.to(model.device)))
+        facts = {"bytes": BYTES_A_POINT * len(points), "learned_first": False}
+        add("others", SPARSE, near, 0.0, **facts)
     found = at_equal_loss(model.mixture, datamanager, contender.grids, others=scores)
     kept = found.pop("others")
-    return found | {"taught": [row | kept[row["name"]] for row in rows]}
+    for row in (row for some in rows.values() for row in some):
+        row |= kept[row["name"]]
+        row["bytes"] = row.pop("octree_bytes", row.get("bytes"))
+    return found | rows
 
 
 def _occupancy_of(trainer: Trainer, data: Path, folder: Path) -> dict[str, Any] | None:

@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 from nerfstudio.cameras.rays import RayBundle
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from leco_plugin.evaluation.field_grids import (
@@ -23,6 +24,7 @@ from leco_plugin.evaluation.field_grids import (
     dilate,
     fits_memory,
     look_up_scores,
+    octree_bytes,
 )
 from leco_plugin.evaluation.inspection import ViewBox, in_parts, whole_box
 from leco_plugin.evaluation.report import finite_or_null
@@ -81,7 +83,7 @@ def at_equal_loss(
     mixture: Mixture,
     datamanager: Any,
     grids: Sequence[Resolution] = (),
-    others: Mapping[str, Callable[[Tensor], Tensor]] | None = None,
+    others: Mapping[str, Callable[[Tensor], Tensor] | Tensor] | None = None,
     config: CalibrationConfig = CALIBRATION,
 ) -> dict[str, Any]:
     """What the mixture's gate keeps at `LOST_SURFACE_MASS`, and grids made from the same field.
@@ -92,13 +94,15 @@ def at_equal_loss(
     Args:
         mixture: whose gate is frozen; it is left as it was.
         datamanager: with held-out training pixels.
-        others: further representations by name, each a score of mapped positions [N, 3]: [N].
+        others: further representations by name, each a score of mapped positions [N, 3]: [N], or
+            the scores [n, n, n] of a grid in `mapped_box`.
     Returns:
         `lost_surface_mass`; `reached_volume`, the share of the scene's box that rays reach;
         `kept_reached_volume` and `kept_candidates`, shares of that and of the candidates between
         near and far; `grids`, the same for each with its `resolution`, its `bytes` at one bit a
-        cell, the `update_seconds` that it took beyond the field, coarser grids included, and
-        whether it keeps least `dilated` by a cell; `others`, what each keeps if there are any; and
+        cell, its `octree_bytes`, the `update_seconds` that it took beyond the field, coarser grids
+        included, and whether it keeps least `dilated` by a cell; `others`, what each keeps if there
+        are any, and of a grid what is said of `grids` too; and
         `left_out`, resolutions that would not fit the free memory, or take minutes of a CPU.
     Raises:
         ValueError: held-out rays see no surface.
@@ -111,8 +115,11 @@ def at_equal_loss(
         volume = reached_volume(mixture, taught, VOLUME_POINTS)
         kept_by = partial(_kept_by, weights)
         kept = kept_by(occupancies, in_parts(mixture.occupancies, volume))
+        of_grid = partial(_kept_by_grid, weights, mapped_box(mixture), mapped, volume)
         beside = {
-            name: kept_by(in_parts(score, mapped), in_parts(score, volume))
+            name: of_grid(score)
+            if isinstance(score, Tensor)
+            else kept_by(in_parts(score, mapped), in_parts(score, volume))
             for name, score in (others or {}).items()
         }
         rows, left_out = [], []
@@ -120,11 +127,7 @@ def at_equal_loss(
             if scores is None:
                 left_out.append(row["resolution"])
                 continue
-            both = []
-            for dilated, cells in enumerate((scores, dilate(scores))):
-                look_up = partial(look_up_scores, cells, mapped_box(mixture))
-                both.append({"dilated": bool(dilated), **kept_by(look_up(mapped), look_up(volume))})
-            rows.append(row | min(both, key=lambda one: one["kept_reached_volume"]))
+            rows.append(row | of_grid(scores))
     return {
         "lost_surface_mass": LOST_SURFACE_MASS,
         "reached_volume": round(len(volume) / VOLUME_POINTS, 5),
@@ -138,6 +141,32 @@ def at_equal_loss(
 def _kept_by(weights: Tensor, of_rays: Tensor, of_volume: Tensor) -> dict[str, float]:
     volume, candidates = kept_shares(weights, of_rays, of_volume, LOST_SURFACE_MASS)
     return {"kept_reached_volume": round(volume, 5), "kept_candidates": round(candidates, 5)}
+
+
+def near_points(points: Tensor) -> Callable[[Tensor], Tensor]:
+    """A score [N] of mapped positions [N, 3]: the nearer the closest of points [P, 3], the more."""
+    tree = cKDTree(points.cpu().numpy())
+
+    def score(mapped: Tensor) -> Tensor:
+        return -torch.from_numpy(tree.query(mapped.cpu().numpy())[0]).to(mapped)
+
+    return score
+
+
+def _kept_by_grid(
+    weights: Tensor, box: ViewBox, mapped: Tensor, volume: Tensor, scores: Tensor
+) -> dict[str, Any]:
+    """What a grid of scores [nx, ny, nz] keeps, as it is or dilated, whichever keeps less; and its
+    bytes as an octree, where it is a cube."""
+    both = []
+    for dilated, cells in enumerate((scores, dilate(scores))):
+        of_rays, of_volume = (look_up_scores(cells, box, places) for places in (mapped, volume))
+        found: dict[str, Any] = {"dilated": bool(dilated)} | _kept_by(weights, of_rays, of_volume)
+        if len(set(cells.shape)) == 1:
+            kept = cells >= threshold_losing(weights, of_rays, LOST_SURFACE_MASS)
+            found["octree_bytes"] = octree_bytes(kept)
+        both.append(found)
+    return min(both, key=lambda one: one["kept_reached_volume"])
 
 
 def _grids_of(

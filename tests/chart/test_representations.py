@@ -106,6 +106,25 @@ def taught(name: str, size: int, kept: float) -> dict[str, object]:
     return {"name": name, "bytes": size, "seconds": 20.0, "kept_reached_volume": kept}
 
 
+def test_grids_of_the_same_lesson_and_sparse_points_stand_beside() -> None:
+    facts = occupancy(50_000, 0.2, GRIDS)
+    facts["at_equal_loss"]["grids"][0] = grid(64, 0.3) | {"octree_bytes": 2_000}
+    facts["at_equal_loss"]["others"] = [
+        taught("taught grid 64³", 1_000, 0.1) | {"learned_first": True},
+        taught("sparse points", 60_000, 0.5) | {"learned_first": False, "seconds": 1.0},
+    ]
+    ours = run("MLP (ours)", learn_seconds=3.0, occupancy=facts)
+    held = {one.name: one for one in representations_of(lines_of(results(ours)))}
+    assert held["taught grid 64³"].median("learn_seconds") == 23.0
+    assert held["sparse points"].median("learn_seconds") == 1.0
+    assert [held[f"grid {cells}³"].median("size") for cells in (64, 128)] == [2.0, 262.144]
+    assert not any(one.ours for name, one in held.items() if name != "MLP (ours)")
+    assert verdict([*held.values()]) == (
+        "MLP (ours) is unbeaten in learning time, behind taught grid 64³ in size "
+        "(one seed: no verdict)"
+    )
+
+
 def test_small_gates_that_the_field_has_taught_stand_beside_those_of_their_kind() -> None:
     facts = occupancy(50_000, 0.2)
     facts["at_equal_loss"]["taught"] = [taught("MLP", 5000, 0.1), taught("hash grid", 9000, 0.12)]

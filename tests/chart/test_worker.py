@@ -174,8 +174,12 @@ def test_small_gates_are_taught_by_the_field_as_it_was_and_stand_beside(
     config = config_of(one, tiny_scene, tmp_path / "nerfstudio")
     result, trainer = train_job(config, one, 3, tiny_scene, SHORT, tmp_path)
     found = result["occupancy"]["at_equal_loss"]
-    taught = found.pop("taught")
-    assert found == alone[0] and "others" not in found  # the gate's own row knows nothing of them
+    taught, others = found.pop("taught"), found.pop("others")
+    assert found == alone[0]  # the gate's own row knows nothing of them
+    grids = [f"taught grid {cells}³" for cells in (32, 64, 128, 256)]
+    assert [row["name"] for row in others] == grids
+    assert all(0 <= row["bytes"] < size**3 / 4 for row, size in zip(others, (32, 64, 128, 256)))
+    assert all(0.0 < row["kept_reached_volume"] <= 1.0 and row["learned_first"] for row in others)
     assert {row["name"]: row["bytes"] for row in taught} == {
         "MLP": 4932,
         "hash grid": 16804,

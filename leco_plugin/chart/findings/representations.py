@@ -30,7 +30,7 @@ class Held(NamedTuple):
     """One representation in one run."""
 
     size: float
-    """kB: a gate's numbers in bfloat16, a grid's cells in bits."""
+    """kB: a gate's numbers in bfloat16, a grid as an octree, or in bits where none was stored."""
     learn_seconds: float | None
     """Seconds until it is there; None for a grid, made from a field that learned a gate too."""
     kept: float
@@ -114,8 +114,8 @@ def never_held_of(lines: Sequence[Line]) -> list[str]:
 
 
 def _held_in(run: Mapping[str, Any], line: Line) -> dict[_What, Held]:
-    """Its gate, small gates that its field has taught, and grids by size; nothing where its gate
-    was not measured."""
+    """Its gate, what its field has taught, sparse points, and grids of densities by size; nothing
+    where its gate was not measured."""
     seconds, kept = (cost.of(run) for cost in (LEARNING, KEPT))
     if seconds is None or kept is None:
         return {}
@@ -127,6 +127,9 @@ def _held_in(run: Mapping[str, Any], line: Line) -> dict[_What, Held]:
         name = SMALL_OURS if is_ours else f"small {row['name']}"
         learned_in = seconds + row["seconds"]
         found[name, is_ours, row["name"]] = _made_of_field(row, row["seconds"], learned_in)
+    for row in occupancy["at_equal_loss"].get("others", ()):
+        learned_in = row["seconds"] + (seconds if row["learned_first"] else 0.0)
+        found[row["name"], False, None] = _made_of_field(row, row["seconds"], learned_in)
     for row in sorted(occupancy["at_equal_loss"]["grids"], key=lambda row: row["resolution"]):
         name = f"grid {row['resolution']}³"
         found[name, False, None] = _made_of_field(row, row["update_seconds"], None)
@@ -134,7 +137,8 @@ def _held_in(run: Mapping[str, Any], line: Line) -> dict[_What, Held]:
 
 
 def _made_of_field(row: Mapping[str, Any], beyond: float, learned_in: float | None) -> Held:
-    return Held(row["bytes"] / 1e3, learned_in, 100.0 * row["kept_reached_volume"], beyond)
+    size = row.get("octree_bytes", row["bytes"])
+    return Held(size / 1e3, learned_in, 100.0 * row["kept_reached_volume"], beyond)
 
 
 def fronts_of(one: Representation, all_of_them: Sequence[Representation]) -> list[str]:
