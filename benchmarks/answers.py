@@ -31,9 +31,9 @@ commands are below; a chart marked (*) was made before a mend that is named ther
 """
 KEPT = """Volume kept, of what rays reach, where each loses 0.1% of the surface mass, and the size
 of the occupancy: less is better in both, and what is on the front is so in the median over seeds.
-Grids, and a small gate of each kind, are made from the field that learned with our gate. A *grid* is
-filled with densities, as hosts fill theirs; a *taught grid* has the lesson that small gates have.
-*Sparse points* keep what is near one of the scene's. More sizes of all are
+Grids, and a small gate of each kind, are made from the field that learned with our gate. A *grid*
+is filled with densities, as hosts fill theirs; a *taught grid* has the lesson that small gates
+have. *Sparse points* keep what is near one of the scene's. More sizes of all are
 [elsewhere](measurements.md#how-much-a-scene-needs-gates-and-grids-at-equal-loss). Sizes are those
 of numbers in bfloat16, and of grids as octrees.
 """
@@ -102,12 +102,15 @@ def _in_short(charts: Sequence[Mapping[str, Any]]) -> str:
     of = f"{len(charts)} scene{'s' if len(charts) > 1 else ''}"
     if LEARNED in figures:
         best = sum(_none_is_better(learned_of(lines_of(results))) for results in charts)
-        return f"On {best} of {of}, no other is better than ours in space kept and in PSNR."
+        return (
+            f"On {best} of {of}, no other is better than ours in space kept and in PSNR beyond the "
+            "spread of seeds."
+        )
     words = [_word(lines_of(results)) for results in charts]
-    ahead, level, behind = map(words.count, ("ahead", "level", "behind"))
+    ahead, level, unknown, behind = map(words.count, ("ahead", "level", "undecided", "behind"))
     ours = sentence(lines_of(charts[0])[0].name)
     said = f"*{ours}* is ahead of the best other on {ahead} of {of}, level with it on {level}"
-    return f"{said}, behind it on {behind or 'none'}."
+    return f"{said}, behind it on {behind or 'none'}; undecided on {unknown or 'none'}."
 
 
 def _none_is_better(learned: Sequence[Learned]) -> bool:
@@ -192,13 +195,16 @@ def _fronts(charts: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _level(learned: Sequence[Learned]) -> str:
-    """Who is level with ours in space kept and in PSNR."""
+    """Who is level with ours in space kept and in PSNR, and of whom the seeds do not say it."""
     ours = ours_of(learned)
     if ours is None or not ours.is_measured:
         return ""
     others = [one for one in learned if one is not ours and one.is_measured]
-    names = [one.name for one in others if words_of(ours, one) == {"level"}]
-    return f"; level with it: {', '.join(names)}" if names else ""
+    words = {one.name: words_of(ours, one) for one in others}
+    level = [name for name, its in words.items() if its == {"level"}]
+    unknown = [name for name, its in words.items() if "undecided" in its <= {"level", "undecided"}]
+    said = f"; level with it: {', '.join(level)}" if level else ""
+    return said + (f"; undecided: {', '.join(unknown)}" if unknown else "")
 
 
 def _answer_of(results: Mapping[str, Any]) -> str:

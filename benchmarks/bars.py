@@ -28,10 +28,10 @@ Values = Sequence[float | None]
 HEAD = """On two CPU cores. *City* is the procedural city of 3 x 3 blocks, as `city` is below. Each
 figure is read from the stored result named beside it: the median over seeds, with the least and the
 most. *Yes*: every seed reaches the bar. *In the median*: the median does, some seeds do not. PSNR
-beside a rival is a difference of means with its 95% interval: ahead, level or behind. A *candidate*
-is a place on a ray at which a model that skips nothing would ask its network. The *price* is what
-skipping costs held-out pixels, *lost surface mass* what it leaves out of the weight near
-surfaces."""
+beside a rival is a difference of means with its 95% interval: ahead, behind, level where that holds
+zero, or undecided where it holds zero and half of it is more than 0.5 dB. A *candidate* is a place
+on a ray at which a model that skips nothing would ask its network. The *price* is what skipping
+costs held-out pixels, *lost surface mass* what it leaves out of the weight near surfaces."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,8 @@ class Bar:
             return [asked, "not stored", "-", "-"]
         mark = " (*)" if Path(self.stored).name in noted(folder) else ""
         if isinstance(values, Verdict):
-            reached = {"ahead": "yes", "level": "level", "behind": "**no**", None: "no verdict"}
-            found = [values.said(), reached[values.word]]
+            reached = {"ahead": "yes", "behind": "**no**", None: "no verdict"}
+            found = [values.said(), reached.get(values.word, str(values.word))]
         else:
             found = [self.measured(values), self.reached(values)]
         return [asked, *found, f"`{self.stored}`{mark}"]

@@ -100,9 +100,11 @@ experts, no gate* has as many scene experts, none for empty space, as Switch-NeR
   seconds to render are of one whole test image or two. FLIP and LPIPS are better when they are
   less. Qualities are means over seeds, with the least and the most; costs, ratios, and figures of
   occupancies are medians.
-- **Ahead**, **level**, **behind**: by the difference of means and its 95% interval over seeds
-  (Welch's t). Level is where the interval holds zero; with one seed there is no verdict. Each
-  comparison stands alone: of twenty between equals, one is expected to differ.
+- **Ahead**, **level**, **undecided**, **behind**: by the difference of means and its 95% interval
+  over seeds (Welch's t). Level is where the interval holds zero and nothing beyond 0.5 dB to a side
+  of the difference (of other figures, a quarter of their mean); where it holds zero and more, the
+  seeds decide nothing. With one seed there is no verdict. Each comparison stands alone: of twenty
+  between equals, one is expected to differ.
 - **Fell**: a run ended more than 0.3 dB below the best point of its own curve.
 - **s to X dB**: after how many seconds of training each method reached what every run reached at
   last, to stay above it. **Trained**: seconds until the last step had ended, which may be more

@@ -86,11 +86,11 @@ def test_a_grid_that_is_smaller_and_keeps_less_is_named(store: Store) -> None:
     )
 
 
-def test_one_that_keeps_less_in_the_median_only_is_named_as_level(store: Store) -> None:
+def test_one_that_keeps_less_in_the_median_only_is_said_to_be_undecided(store: Store) -> None:
     store("representations", "city", *representations(10.0, grid_kept=(0.05, 0.05, 0.3)), **STEPS)
     text = answered()
     assert "on 0 of 1 scene, nothing learned as soon on 1." in text
-    assert "behind grid 64³ (level in space) in size (3 seeds) |" in text
+    assert "behind grid 64³ (undecided in space) in size (3 seeds) |" in text
 
 
 def test_minutes_are_those_of_runs_two_at_a_time_and_shared_ones_count_once(store: Store) -> None:

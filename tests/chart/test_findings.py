@@ -86,8 +86,9 @@ def test_the_headline_names_the_leader_and_its_lead_beyond_the_spread_of_seeds()
     assert headline(results(*cold, *best)) == f"{said}, whose grid is still in its warm-up"
     noisy = of("NGP + a", 18.0, 22.0, 20.0)
     assert headline(results(*noisy, *best)) == (
-        "b and a are level: 21.5 and 20.0 dB, 1.50 ± 4.95 apart (3 seeds)"
+        "b and a are undecided: 21.5 and 20.0 dB, 1.50 ± 4.95 apart (3 seeds)"
     )
+    assert headline(results(*noisy, *best), short=True) == "b or the next best: undecided"
     assert headline(results(*other[:1], *best)) == "b 21.5 dB, a 20.0 dB (one seed: no verdict)"
 
 
@@ -140,7 +141,7 @@ def test_runs_are_held_against_the_mean_and_median_of_the_rival_not_against_a_se
     theirs[0] |= {"render_seconds_per_image": 2.0, "train_seconds": 12.0}
     (found,) = rivals(lines_of(results(*ours, *theirs)))
     assert found.psnr.difference == pytest.approx(73.0 / 3 - 19.5)
-    assert (found.psnr.word, found.psnr.seeds) == ("level", (3, 2))
+    assert (found.psnr.word, found.psnr.seeds) == ("undecided", (3, 2))
     assert found.passed == (8.5, 7.5, 5.0)  # 19.5 dB: a decibel a second until second ten
     assert found.sooner == pytest.approx((10 / 8.5, 10 / 7.5, 2.0))
     assert found.faster == (3.0, 3.0, 3.0)

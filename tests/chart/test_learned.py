@@ -95,11 +95,16 @@ def test_a_title_without_ours_says_so() -> None:
 
 
 def test_those_that_seeds_do_not_tell_apart_in_both_are_level() -> None:
-    near = keeping("near", (0.055, 20.5), (0.07, 22.0), (0.08, 22.0))
+    ours = keeping("A (ours)", (0.05, 20.6), (0.051, 20.7), (0.052, 20.8))
+    near = keeping("near", (0.05, 20.6), (0.052, 20.8), (0.054, 20.9))
+    vague = keeping("vague", (0.05, 20.0), (0.052, 20.8), (0.054, 22.0))
     more = keeping("more", (0.055, 25.0), (0.07, 25.0), (0.08, 25.0))
     wide = keeping("wide", (0.25, 20.5), (0.3, 20.5), (0.35, 20.5))
-    learned = learned_of(lines_of(results(*OURS, *near, *more, *wide, *skipping("never", 0.5))))
-    assert [one.name for one in learned[1:] if words_of(learned[0], one) == {"level"}] == ["near"]
+    others = [*near, *vague, *more, *wide, *skipping("never", 0.5)]
+    learned = learned_of(lines_of(results(*ours, *others)))
+    words = {one.name: words_of(learned[0], one) for one in learned[1:]}
+    assert [name for name, its in words.items() if its == {"level"}] == ["near"]
+    assert words["vague"] == {"level", "undecided"}
 
 
 def test_a_gate_that_was_frozen_with_the_last_step_has_guided_nothing() -> None:

@@ -131,7 +131,7 @@ def _standing_of(one: Learned, others: Sequence[Learned]) -> str:
 def words_of(one: Learned, other: Learned) -> set[str | None]:
     """The verdicts on space, of which less is better, and on PSNR: one where they agree."""
     mine, theirs = (list(some.kept_by_seed.values()) for some in (one, other))
-    return {compare(theirs, mine).word, compare(one.psnrs, other.psnrs).word}
+    return {compare(theirs, mine, close=None).word, compare(one.psnrs, other.psnrs).word}
 
 
 def ours_of(learned: Sequence[Learned]) -> Learned | None:

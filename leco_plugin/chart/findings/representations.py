@@ -78,7 +78,7 @@ class Representation:
 
     def against(self, other: Representation, figure: str) -> Verdict:
         """Whether it is ahead in a figure of `Held`, of which less is better; both have it."""
-        return compare(other.of_seeds(figure), self.of_seeds(figure))
+        return compare(other.of_seeds(figure), self.of_seeds(figure), close=None)
 
     def leads(self, other: Representation, figure: str) -> bool:
         """Whether it keeps no more at no more cost, and is better in one of the two: medians."""
@@ -198,8 +198,11 @@ def _place_of(one: Representation, all_of_them: Sequence[Representation]) -> str
     others = [other for other in all_of_them if other is not one]
     if all(one.kept <= other.kept for other in others):
         said = f"{one.name} keeps least space, {one.kept:.1f}% in {one.median('size'):.0f} kB"
-        level = [other.name for other in others if one.against(other, "kept").word == "level"]
-        return f"{said}, level with {' and '.join(level)}" if level else said
+        words = {other.name: one.against(other, "kept").word for other in others}
+        for word, beside in (("level", "level with"), ("undecided", "undecided against")):
+            if names := [name for name, its in words.items() if its == word]:
+                said += f", {beside} {' and '.join(names)}"
+        return said
     fronts = fronts_of(one, all_of_them)
     by_cost = [name for name in fronts if _is_cheapest(one, others, COSTS[name])]
     by_space = [name for name in fronts if name not in by_cost]
@@ -211,7 +214,7 @@ def _place_of(one: Representation, all_of_them: Sequence[Representation]) -> str
 
 def _is_cheapest(one: Representation, others: Sequence[Representation], figure: str) -> bool:
     return all(
-        other.median(figure) > one.median(figure) and one.against(other, figure).word != "level"
+        other.median(figure) > one.median(figure) and not one.against(other, figure).is_open
         for other in others
         if other.has(figure)
     )
@@ -221,7 +224,8 @@ def _best_ahead(one: Representation, others: Sequence[Representation], figure: s
     """Of those that lead a representation, the one that keeps least, and what is level."""
     leaders = [other for other in others if other.has(figure) and other.leads(one, figure)]
     best = min(leaders, key=lambda other: other.kept)
-    if best.against(one, "kept").word != "level":
+    space = best.against(one, "kept")
+    if not space.is_open:
         return best.name
-    is_cheaper = best.against(one, figure).word != "level"
-    return f"{best.name} (level in space)" if is_cheaper else f"{best.name} (level)"
+    alone = "" if best.against(one, figure).is_open else " in space"
+    return f"{best.name} ({space.word}{alone})"

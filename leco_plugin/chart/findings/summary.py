@@ -16,18 +16,26 @@ from leco_plugin.chart.contender import Protocol, shared_method, short_names
 
 CONFIDENCE = 0.95
 """Of the interval around a difference of means; of each comparison alone, however many are made."""
+CLOSE, CLOSE_SHARE = 0.5, 0.25
+"""The widest margin with which two are level: dB, or of other figures a share of their means. With
+a wider one the seeds do not decide."""
 
 
 @dataclass(frozen=True)
 class Verdict:
     """A difference of means, and what its interval over seeds says."""
 
-    word: Literal["ahead", "level", "behind"] | None
+    word: Literal["ahead", "level", "undecided", "behind"] | None
     """Ahead is more. None where a side has one seed, or a figure is no number."""
     difference: float
     margin: float | None
     """Half the interval's width; None where there is none."""
     seeds: tuple[int, int]
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the interval holds zero."""
+        return self.word in ("level", "undecided")
 
     @property
     def by(self) -> str:
@@ -44,9 +52,13 @@ class Verdict:
         return f"{word}{self.difference:+{form}}{margin} {unit}, {self.by}"
 
 
-def compare(ours: Sequence[float], theirs: Sequence[float]) -> Verdict:
+def compare(ours: Sequence[float], theirs: Sequence[float], close: float | None = CLOSE) -> Verdict:
     """Compares a figure of each run of two contenders by the 95% interval of Welch's t around the
-    difference of their means: level where that holds zero. Swap the two for a cost.
+    difference of their means. Where that holds zero the two are level, or, if its half is wider
+    than `close`, undecided. Swap the two for a cost.
+
+    Args:
+        close: in the figure's unit, PSNR by default; of None `CLOSE_SHARE` of the mean of all.
 
     Runs with the same seed share nothing but its number, so that they are no pairs, and two
     contenders need not scatter alike. `ValueError` where one of them has no run.
@@ -64,7 +76,11 @@ def compare(ours: Sequence[float], theirs: Sequence[float]) -> Verdict:
         freedom = squared**2 / sum(e**2 / (n - 1) for e, n in zip(errors, counts))
         margin = float(stdtrit(freedom, 0.5 + CONFIDENCE / 2)) * math.sqrt(squared)
     word: Any = "ahead" if difference > 0.0 else "behind"
-    return Verdict("level" if abs(difference) <= margin else word, difference, margin, counts)
+    if abs(difference) <= margin:
+        if close is None:
+            close = CLOSE_SHARE * abs(statistics.fmean([*ours, *theirs]))
+        word = "level" if margin <= close else "undecided"
+    return Verdict(word, difference, margin, counts)
 
 
 LOST_SURFACE_MASS = 1e-3
@@ -236,9 +252,10 @@ def headline(results: Mapping[str, Any], short: bool = False) -> str:
     if found.margin is None:
         return f"{best.name} {best.psnr:.1f} dB, {second.name} {second.psnr:.1f} dB ({found.by})"
     apart = f"{found.difference:.2f} ± {found.margin:.2f}"
-    if found.word == "level":
+    if found.is_open:
         figures = f"{best.psnr:.1f} and {second.psnr:.1f} dB"
-        said = f"{best.name} and {second.name} are level: {figures}, {apart} apart ({found.by})"
+        both = f"{best.name} and {second.name} are {found.word}"
+        said = f"{both}: {figures}, {apart} apart ({found.by})"
         others = [line for line in ranked if not line.learned]
         if best.learned and second.learned and others:
             lead = compare(best.psnrs, others[0].psnrs)
@@ -247,7 +264,10 @@ def headline(results: Mapping[str, Any], short: bool = False) -> str:
                 if short:
                     return f"two with learned occupancy lead by {beyond} dB"
                 return f"{said}; {others[0].name}, the best of the others, is {beyond} behind"
-        return f"{best.name} is level with the next best" if short else said
+        if not short:
+            return said
+        level = f"{best.name} is level with the next best"
+        return level if found.word == "level" else f"{best.name} or the next best: undecided"
     if short:
         return f"{best.name} is ahead by {apart} dB"
     said = f"{best.name} is ahead: {best.psnr:.1f} dB, {apart} more than {second.name} ({found.by})"
