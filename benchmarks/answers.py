@@ -65,20 +65,6 @@ def answers_section() -> list[str]:
     return [HEAD, *parts, *minutes_section(shown)] if parts else []
 
 
-def short_answers() -> list[str]:
-    """Suite by suite the question, an answer over all scenes, and a line for each scene."""
-    parts, noted = [], notes()
-    for suite, its in SUITES.items():
-        if charts := list(by_scene(suite).values()):
-            parts.append(f"- **{its.question}** {_in_short([results for _, results in charts])}")
-            parts += [
-                f"    - {_link(results, 'suites.md')}{' (*)' if name in noted else ''}: "
-                f"{_answer_of(results)}."
-                for name, results in charts
-            ]
-    return [*parts, ""]
-
-
 def _answer(charts: Sequence[tuple[str, dict[str, Any]]]) -> list[str]:
     noted = notes()
     kinds = [_kind(results) for _, results in charts]
@@ -90,12 +76,12 @@ def _answer(charts: Sequence[tuple[str, dict[str, Any]]]) -> list[str]:
         scene = _link(results) + (" (*)" if name in noted else "")
         shown = [row.get(column, "-") for column in columns]
         rows.append([scene, *shown, _answer_of(results)])
-    counted = f"{_in_short([results for _, results in charts])}\n"
+    counted = f"{in_short([results for _, results in charts])}\n"
     return [figures, *table(f"scene | {' | '.join(columns)} |", rows), "", counted]
 
 
-def _in_short(charts: Sequence[Mapping[str, Any]]) -> str:
-    """One sentence over the scenes of a suite, whose first contender is ours."""
+def in_short(charts: Sequence[Mapping[str, Any]]) -> str:
+    """A sentence or two over the scenes of a suite, whose first contender is ours."""
     figures = {_kind(results)[0] for results in charts}
     if KEPT in figures:
         return _fronts(charts)
@@ -109,8 +95,10 @@ def _in_short(charts: Sequence[Mapping[str, Any]]) -> str:
     words = [_word(lines_of(results)) for results in charts]
     ahead, level, unknown, behind = map(words.count, ("ahead", "level", "undecided", "behind"))
     ours = sentence(lines_of(charts[0])[0].name)
-    said = f"*{ours}* is ahead of the best other on {ahead} of {of}, level with it on {level}"
-    return f"{said}, behind it on {behind or 'none'}; undecided on {unknown or 'none'}."
+    counts = {"level with it": level, "behind it": behind, "undecided": unknown}
+    rest = [f"{word} on {count}" for word, count in counts.items() if count]
+    said = f"*{ours}* is ahead of the best other on {ahead or 'none'} of {of}"
+    return ", ".join([said, *rest]) + "."
 
 
 def _none_is_better(learned: Sequence[Learned]) -> bool:
@@ -131,9 +119,9 @@ def _word(lines: Sequence[Line]) -> str | None:
     return compare(ours.psnrs, best.psnrs).word
 
 
-def _link(results: Mapping[str, Any], page: str = "") -> str:
+def _link(results: Mapping[str, Any]) -> str:
     scene = results["scene"]["name"]
-    return f"[{scene}]({page}#suite-{results['suite']}-on-{scene})"
+    return f"[{scene}](#suite-{results['suite']}-on-{scene})"
 
 
 def _kind(results: Mapping[str, Any]) -> tuple[str, Callable[[Sequence[Line]], dict[str, str]]]:

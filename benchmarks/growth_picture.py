@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 
 import checkout  # noqa: F401
 from page_parts import table
+from sizes_tables import chosen_of
 
-from leco_plugin.capacity.choice import Row, choose, kilobytes
+from leco_plugin.capacity.choice import Row, kilobytes, stored_bytes
 from leco_plugin.chart.theme import (
     LIGHT,
     Theme,
@@ -26,7 +27,7 @@ Reports = Mapping[str, Any]
 """Results of `leco capacity`, by the name of their scene."""
 CITY = "city-"
 """How names of cities begin; the blocks a side follow."""
-LINES = ("gate, the chosen one", "grid, the best one")
+LINES = ("gate", "grid with the same lesson")
 
 
 class Grown(NamedTuple):
@@ -40,7 +41,7 @@ class Grown(NamedTuple):
     photographs: int
     gate: Row
     grid: Row
-    """The grid that keeps least; of those within 5% of it, the smallest."""
+    """Chosen among grids, as octrees, as the gate is among gates: by bytes and volume kept."""
 
     @property
     def times(self) -> float:
@@ -55,20 +56,11 @@ def cities(reports: Reports) -> list[Grown]:
         blocks = name.removeprefix(CITY)
         if name == blocks or not blocks.isdigit():
             continue
-        rows = report["representations"]
-        grids = [row for row in rows if row["family"] == "grid"]
-        least = 1.05 * min(row["kept_volume"] for row in grids)
-        grid = min((row for row in grids if row["kept_volume"] <= least), key=_bytes)
-        gate = choose([row for row in rows if row["family"] != "grid"])
+        gate, grid = chosen_of(report)
         config = CityConfig(int(blocks))
         area = float(City(config).built.sum()) * config.block_size**2
         found.append(Grown(int(blocks), name, area, report["scene"]["train_images"], gate, grid))
     return sorted(found)
-
-
-def _bytes(row: Row) -> int:
-    """Of a gate, or of a grid as an octree."""
-    return int(row.get("octree_bytes", row["bytes"]))
 
 
 def growth_table(reports: Reports) -> str:
@@ -83,16 +75,16 @@ def growth_table(reports: Reports) -> str:
             f"{one.gate['bytes'] / 1000:.1f}",
             f"{one.gate['kept_volume']:.2%}",
             f"{one.grid['size']}^3",
+            f"{one.grid['bytes'] / 1000:,.1f}",
             kilobytes(one.grid),
-            f"{_bytes(one.grid) / 1000:,.1f}",
             f"{one.grid['kept_volume']:.2%}",
             f"{one.times:.1f}",
         )
         for one in grown
     ]
     header = (
-        "blocks a side | built, m2 | photographs | gate | kB | keeps | grid | a bit a cell "
-        "| as an octree, kB | keeps | times the gate's"
+        "blocks a side | built, m2 | photographs | gate | kB | keeps | grid | kB, a bit a cell "
+        "| as an octree | keeps | times the gate's"
     )
     return "\n".join([*table(header, cells), "", finding(grown)])
 
@@ -102,17 +94,18 @@ def finding(grown: Sequence[Grown]) -> str:
     first, last = grown[0], grown[-1]
     kept = f"{_span([100 * one.gate['kept_volume'] for one in grown])}% of the volume"
     times = f"{_span([one.times for one in grown])} times as much"
+    octrees = [stored_bytes(one.grid) / 1000 for one in grown]
     return (
         f"From {first.blocks} to {last.blocks} blocks a side the gate takes "
-        f"{_span([one.gate['bytes'] / 1000 for one in grown])} kB and keeps {kept}. The best grid "
-        f"keeps {times} and takes {_span([_bytes(one.grid) / 1000 for one in grown])} kB as an "
-        "octree."
+        f"{_span([one.gate['bytes'] / 1000 for one in grown])} kB and keeps {kept}. A grid with "
+        f"the same lesson, chosen by the same rule, takes {_span(octrees)} kB as an octree and "
+        f"keeps {times}. Neither follows the area."
     )
 
 
 def headline(grown: Sequence[Grown]) -> str:
     """The finding in ten words at most."""
-    return f"Grids keep {_span([one.times for one in grown])} times a gate's volume"
+    return f"An octree keeps {_span([one.times for one in grown])} times a gate's volume"
 
 
 def _span(values: Sequence[float]) -> str:
@@ -133,7 +126,7 @@ def draw(path: Path, reports: Reports, theme: Theme = LIGHT) -> Path:
     pairs = [(one.gate, one.grid) for one in grown]
     panels = (
         ("volume kept, %", [[100 * row["kept_volume"] for row in pair] for pair in pairs]),
-        ("kB, grids as octrees", [[_bytes(row) / 1000 for row in pair] for pair in pairs]),
+        ("kB, grids as octrees", [[stored_bytes(row) / 1000 for row in pair] for pair in pairs]),
     )
     with themed(theme, 11.5):
         figure = new_figure((10.0, 4.6), theme.page)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import statistics
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import checkout  # noqa: F401
@@ -19,6 +19,14 @@ GAIN_CHART = "caliterra-hosts"
 GIFTS_CHART = "caliterra-gifts"
 """A host with a learned occupancy, with and without what else it gets, and with its own grid."""
 OURS = "leco-occupancy"
+CLEAR = ("ahead", "behind")
+STANDS = {
+    "ahead": "ahead of",
+    "level": "level with",
+    "undecided": "undecided against",
+    "behind": "behind",
+}
+"""Words before the name of a rival."""
 
 
 def readme(text: str) -> str:
@@ -39,8 +47,8 @@ def without_gifts(results: Mapping[str, Any]) -> str:
     """What a learned row of the gain has without what else it gets beside its gate."""
     without = _psnrs(lines_of(results)[1])
     return (
-        "Instant-NGP learns with more than a gate; without its opaque start and distances of "
-        f"sparse points, runs have {without} dB "
+        "Part of Instant-NGP's lead is how its run begins: without its opaque and careful start, "
+        f"distances of sparse points and bounds, three runs end at {without} dB "
         "([more](docs/results.md#what-is-gained-in-the-same-time))."
     )
 
@@ -73,8 +81,7 @@ def demo_table(report: dict[str, Any]) -> str:
 
 
 def gain_table(results: Mapping[str, Any]) -> str:
-    """Accuracy, rendering and queries of each contender, and ours against the best row without a
-    learned occupancy, and against the best other method."""
+    """Accuracy, rendering and queries of each contender, and `gains`."""
     lines = lines_of(results)
     seconds, scene = results["protocol"]["seconds"], results["scene"]["name"]
     cores = max(1, results["machine"]["threads"] // results["protocol"].get("at_once", 1))
@@ -90,14 +97,7 @@ def gain_table(results: Mapping[str, Any]) -> str:
         ]
         for line in lines
     ]
-    ours = next(line for line in lines if line.method == OURS and line.learned)
-    plain = [line for line in lines if not line.learned]
-    best = max(plain, key=lambda line: line.psnr)
-    host = max((line for line in plain if line.method != OURS), key=lambda line: line.psnr)
-    said = "**In the same time,** beside the best row without a learned occupancy "
-    said += f"(*{best.name}*), {ours.name} is {_beside(ours, best)}"
-    if host is not best:
-        said += f" Beside the best other method (*{host.name}*) it is {_beside(ours, host)}"
+    said = "**In the same time,** with a learned occupancy, " + gains(lines)
     words = (
         "A query asks a network about one point; *small* ones ask a proposal network or a gate. "
         "*LeCO* is the paper's model: several small networks, the *experts*. A *host* is a method "
@@ -111,8 +111,8 @@ def gifts_sentence(results: Mapping[str, Any], anchor: str) -> str:
     """What a learned row gets beside its gate is worth, seed by seed."""
     learned, without, own = map(_psnrs, lines_of(results))
     return (
-        "The learned row of Instant-NGP gets more than a gate: an opaque start, a careful one, and "
-        f"distances of sparse points. [Seed by seed](measurements.md#{anchor}), after "
+        "The learned row of Instant-NGP gets more than a gate: an opaque start, a careful one, "
+        f"bounds and distances of sparse points. [Seed by seed](measurements.md#{anchor}), after "
         f"{results['protocol']['seconds']:g} s: {learned} dB with all of it, {without} without, "
         f"{own} with its own grid. A host that begins transparent may never find a surface: that "
         "is what the opaque start is for. A grid keeps the whole box at first, and is opaque by "
@@ -120,16 +120,28 @@ def gifts_sentence(results: Mapping[str, Any], anchor: str) -> str:
     )
 
 
-def _beside(ours: Line, rival: Line) -> str:
-    """What ours gains, the end of a sentence."""
-    times, queries = (
-        _median(rival, name) / _median(ours, name)
-        for name in ("render_seconds_per_image", "field_queries_per_ray")
-    )
-    return (
-        f"{compare(ours.psnrs, rival.psnrs).said(form='.1f')}. It renders {times:.1f} times as "
-        f"fast and asks the field {queries:.1f} times less often."
-    )
+def gains(lines: Sequence[Line]) -> str:
+    """How each method with a learned occupancy stands beside its other rows, the paper's last."""
+    learned = sorted((line for line in lines if line.learned), key=lambda line: line.method == OURS)
+    parts = []
+    for ours in learned:
+        host = ours.name.split(" + ")[0]
+        rivals = [line for line in lines if line.method == ours.method and not line.learned]
+        rivals.sort(key=lambda line: -line.psnr)
+        beside = [_beside(ours, rival, host) for rival in rivals]
+        parts += [f"{host} is {' and '.join(beside)}"] if beside else []
+    return ". ".join(parts) + "."
+
+
+def _beside(ours: Line, rival: Line, host: str) -> str:
+    """What ours gains over another row of its host."""
+    name = rival.name.removeprefix(host).lstrip(" +,")
+    times = _median(rival, "render_seconds_per_image") / _median(ours, "render_seconds_per_image")
+    found = compare(ours.psnrs, rival.psnrs)
+    word = STANDS.get(found.word, "beside")
+    by = f"{abs(found.difference) if found.word in CLEAR else found.difference:.1f}"
+    margin = f"± {found.margin:.1f} dB" if found.margin is not None else f"dB, {found.by}"
+    return f"{word} *{name}* by {by} {margin} (renders {times:.1f} times as fast)"
 
 
 def _psnrs(line: Line) -> str:

@@ -14,10 +14,11 @@ import sys
 from typing import Any
 
 import checkout  # noqa: F401
-from answers import answers_section, short_answers
+from answers import answers_section
 from bars import bars_section
 from chart_sections import chart_sections, suite_sections, titles
-from growth_picture import cities, finding, growth_table
+from eight_questions import eight_answers
+from growth_picture import cities, growth_table
 from large_scene_tables import LARGE_SCENES
 from learning import sentence as learning_sentence
 from page_parts import RESULTS, ROOT, machine_line, made_line, noted, picture, section, table
@@ -59,19 +60,16 @@ The demo's city is known exactly, which photographs never are:
 """
 QUESTIONS = """## The reviewers' questions, answered
 
-Questions of the paper's reviewers, each on every scene of its suite; in the last two the host is
-Switch-NeRF, in the others the paper's model. A scene's name leads to its chart; the
-[tables](suites.md#the-answers-with-their-figures) have all contenders.
+Four scenes a question, three seeds; [Suites](suites.md#the-answers-with-their-figures) has them
+scene by scene. In question 5 the host is Switch-NeRF, in the others it is the paper's model.
 """
 MORE = """## Further
 
 - **Is a grid enough?**{star} {capacity} [Gates and grids at equal
   loss](measurements.md#how-much-a-scene-needs-gates-and-grids-at-equal-loss).
 - **Does it fail, and when?** {stability} The learned runs have 200 steps
-  more and begin opaque; proposal networks fail by samples beside the surface, hardly by PSNR.
-  [Stability](stability.md) shows each case.
-- **How does it grow with a city?**{star} {growth}
-  [Growth](measurements.md#how-occupancy-grows-with-a-city).
+  more, 2.1 times the rays, sparse points, and begin opaque; proposal networks fail by samples
+  beside the surface, hardly by PSNR. [Stability](stability.md) shows each case.
 - **Where does the time of a step go?** [A profile](measurements.md#where-the-time-of-a-step-goes).
 - **On a GPU?** Nobody has measured it; [Use a GPU](gpu.md) says how to.
 """
@@ -242,13 +240,18 @@ def page() -> str:
     gifts = gifts_sentence(chart, heading_anchor(titles()[GIFTS_CHART]))
     note = GAIN_NOTE.format(anchor=anchor, gifts=gifts)
     parts = [HEAD, f"{gain()}\n", f"{picture(GAIN_CHART)}\n", note]
-    parts += [f"{demo_table(demo)}\n", *bars_section(RESULTS), QUESTIONS, *short_answers()]
+    parts += [
+        f"{demo_table(demo)}\n",
+        *bars_section(RESULTS),
+        QUESTIONS,
+        *eight_answers(scene_results("capacity")),
+        "",
+    ]
     stability = json.loads((RESULTS / "stability.json").read_text())
     found = {
         "star": " (*)" if "capacity" in noted(RESULTS) else "",
         "capacity": where_it_pays(scene_results("capacity")),
         "stability": sentence(headline(stability)),
-        "growth": finding(cities(scene_results("capacity"))),
     }
     return "\n".join([*parts, MORE.format(**found)])
 

@@ -15,7 +15,6 @@ from page_parts import made_line
 from sizes import TABLE, Options, dry, larger, stored_rows, sweep
 from sizes_figures import bars, verdict
 from sizes_tables import (
-    beside_fine_grid,
     capacity_table,
     samples_table,
     shrink_table,
@@ -178,33 +177,21 @@ def test_a_shrunk_gate_that_misses_a_bar_stands_out() -> None:
     assert "to 5.9 | - | 5.60e-04 |" in shrink_table({"a": shrunk(empty_fraction=None)})
 
 
-def test_the_fine_grid_stands_beside_the_best_gate_of_a_hundredth_of_its_bytes() -> None:
-    kinds = (
-        ("hash", "8", 30_000, 0.02),
-        ("vm", "4", 20_000, 0.05),
-        ("frequency", "2", 5_000, 0.07),
-    )
-    rows = [
+def test_gate_and_grid_of_one_lesson_are_chosen_alike_and_by_the_bytes_of_octrees() -> None:
+    kinds = (("hash", "8", 30_000, 0.02), ("vm", "4", 20_000, 0.05))
+    rows: list[dict[str, Any]] = [
         {"family": family, "size": size, "bytes": count, "kept_volume": kept}
-        for family, size, count, kept in (*kinds, ("grid", "256", 256**3 // 8, 0.06))
+        for family, size, count, kept in (*kinds, ("grid", "256", 256**3 // 8, 0.019))
     ]
-    grid, gate = beside_fine_grid(rows)
-    assert grid is rows[3] and gate is rows[1]
-    assert beside_fine_grid(rows[:3]) == (None, None)
-    coarse = {"family": "grid", "size": "32", "bytes": 32**3 // 8, "kept_volume": 0.04}
-    finer = {"family": "grid", "size": "512", "bytes": 512**3 // 8, "kept_volume": 0.01}
-    grid, gate = beside_fine_grid([*rows, coarse, finer])  # a coarser one that keeps less counts
-    assert grid is coarse and gate is rows[1]
     report = {"scene": {"train_images": 53}, "representations": rows}
-    usual = {"family": "grid", "size": "64", "bytes": 64**3 // 8, "kept_volume": 0.02}
-    of_object = report | {"representations": [*rows, usual]}
-    *_, line, _, _, said = capacity_table({"city-3": report, "fox": of_object}).splitlines()
-    assert (
-        line
-        == "| city-3 | 53 | hash 8 | 30.0 | 2.00 | none | 6.00 (256^3) | 5.00 (vm, 20.0 kB) | yes |"
-    )
-    assert "as the gate that is chosen, for: fox." in said
-    assert "The gate keeps less for: city-3." in said
+    small = {"family": "grid", "size": "64", "bytes": 64**3 // 8, "kept_volume": 0.022}
+    of_object = report | {"representations": [*rows, small | {"octree_bytes": 900}]}
+    first, second, _, said = capacity_table({"city-3": report, "fox": of_object}).splitlines()[2:]
+    gate = "53 | hash 8 | 30.0 kB | 2.00%"
+    assert first == f"| city-3 | {gate} | 256^3 | 2,097.2 kB | 2.1 MB | 1.90% | gate |"
+    assert second == f"| fox | {gate} | 64^3 | 32.8 kB | 0.9 kB | 2.20% | grid |"
+    assert "the grid keeps 0.9 to 1.1 times the gate's volume" in said
+    assert "the grid pays more for: fox; the gate for: city-3." in said
 
 
 def test_what_is_stored_is_shown_city_after_city(

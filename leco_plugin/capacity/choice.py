@@ -48,17 +48,34 @@ NAMES = {
 """Of the families of representations."""
 
 
+def stored_bytes(row: Row) -> int:
+    """Of a gate, or of a grid as an octree, where that is known."""
+    return max(1, row.get("octree_bytes", row["bytes"]))
+
+
 def choose(rows: Sequence[Row]) -> Row:
-    """The representation beside which no other keeps so much less that its bytes pay."""
+    """The representation beside which no other keeps so much less that its bytes pay. One that
+    keeps all is none."""
     power = -math.log10(WORTH_TEN_TIMES)
-    return min(rows, key=lambda row: (row["kept_volume"] * row["bytes"] ** power, row["bytes"]))
+
+    def worth(row: Row) -> tuple[bool, float, int]:
+        size = stored_bytes(row)
+        return row["kept_volume"] >= 1.0, row["kept_volume"] * size**power, size
+
+    return min(rows, key=worth)
+
+
+def best_gate(rows: Sequence[Row]) -> Row | None:
+    """The same of the gates alone; None without any."""
+    gates = [row for row in rows if row["family"] != "grid"]
+    return choose(gates) if gates else None
 
 
 def smallest_grid(rows: Sequence[Row], chosen: Row, times: float = TOLERANCE) -> Row | None:
     """The smallest grid that keeps at most `times` the chosen volume; None where none does."""
     limit = times * chosen["kept_volume"]
     enough = [row for row in rows if row["family"] == "grid" and row["kept_volume"] <= limit]
-    return min(enough, key=lambda row: row["bytes"], default=None)
+    return min(enough, key=stored_bytes, default=None)
 
 
 def grid_that_suffices(rows: Sequence[Row], times: float = TOLERANCE) -> Row | None:
@@ -76,7 +93,8 @@ def title_of(rows: Sequence[Row]) -> str:
     """What the scene needs, in ten words at most."""
     chosen = choose(rows)
     if grid := chosen if chosen["family"] == "grid" else grid_that_suffices(rows):
-        return f"A grid suffices: {grid['size']}³ cells, {kilobytes(grid)}"
+        octree = " as an octree" if "octree_bytes" in grid else ""
+        return f"A grid suffices: {grid['size']}³ cells, {kilobytes(grid)}{octree}"
     may = "; perhaps a grid" if grid_that_nearly_suffices(rows) else ""
     return f"A gate of {kilobytes(chosen)} suffices{may}"
 
@@ -86,29 +104,32 @@ def verdict(rows: Sequence[Row]) -> str:
     chosen = choose(rows)
     kept = f"keeps {chosen['kept_volume']:.1%} of the volume"
     if chosen["family"] == "grid":
-        return f"A grid suffices: {_of_cells(chosen)}, {kept}; no gate keeps as little for less."
-    gate = f"a {NAMES[chosen['family']]} {kept}"
-    said = f"This scene needs {kilobytes(chosen)}: {gate}."
+        said = f"A grid suffices: {_of_cells(chosen)}, {kept}"
+        if gate := best_gate(rows):
+            said += f"; the gate that pays most, {kilobytes(gate)}, {gate['kept_volume']:.1%}"
+        return f"{said}."
+    named = f"a {NAMES[chosen['family']]} {kept}"
+    said = f"This scene needs {kilobytes(chosen)}: {named}."
     sizes = [int(row["size"]) for row in rows if row["family"] == "grid"]
     if not sizes:
         return said
     if grid := grid_that_suffices(rows):
-        return f"A grid suffices: {_of_cells(grid)}. With {kilobytes(chosen)} {gate}, as little."
+        return f"A grid suffices: {_of_cells(grid)}. With {kilobytes(chosen)} {named}, as little."
     if nearly := grid_that_nearly_suffices(rows):
         return (
             f"{said} A grid of {_of_cells(nearly)}, keeps {nearly['kept_volume']:.1%}: with one "
             "field the two are not told apart, and a grid may suffice."
         )
     if large := smallest_grid(rows, chosen):
-        times = f"{large['bytes'] / chosen['bytes']:.0f} times as many bytes"
-        if "octree_bytes" in large:
-            times += f" ({large['octree_bytes'] / chosen['bytes']:.1f} times as an octree)"
+        times = f"{stored_bytes(large) / stored_bytes(chosen):.1f} times as many bytes"
+        times += " as an octree" if "octree_bytes" in large else ""
         return f"{said} A grid that keeps as little takes {large['size']}^3 cells, {times}."
     return f"{said} No grid up to {max(sizes)}^3 keeps as little."
 
 
 def _of_cells(grid: Row) -> str:
-    return f"{grid['size']}^3 cells, {kilobytes(grid)}"
+    octree = " as an octree" if "octree_bytes" in grid else ""
+    return f"{grid['size']}^3 cells, {kilobytes(grid)}{octree}"
 
 
 def common_volume(rows: Sequence[Row]) -> int:
@@ -119,20 +140,20 @@ def common_volume(rows: Sequence[Row]) -> int:
 
 def kilobytes(row: Row) -> str:
     """The bytes of a representation, for people."""
-    size = row["bytes"]
+    size = stored_bytes(row)
     return f"{size / 1000:.1f} kB" if size < 1e6 else f"{size / 1e6:.1f} MB"
 
 
 def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
     """Draws two panels over the bytes: volume kept at equal loss, loss at equal volume."""
-    rows = results["representations"]
+    rows = [row for row in results["representations"] if row["kept_volume"] < 1.0]
     volume = common_volume(rows)
     kept = [100.0 * row["kept_volume"] for row in rows]
     lost = [max(row["lost_at_volumes"][volume], LEAST) for row in rows]
     with themed(theme):
         figure = new_figure((11, 5.9), theme.page)
         figure.text(0.015, 0.975, title_of(rows), va="top", fontsize=17, fontweight="bold")
-        said = f"{textwrap.fill(verdict(rows), 120)}\n{circumstances(results)}"
+        said = "\n".join(textwrap.fill(one, 118) for one in (verdict(rows), circumstances(results)))
         figure.text(0.015, 0.9, said, va="top", fontsize=11)
         panels = [figure.add_axes((0.065 + 0.485 * i, 0.2, 0.435, 0.5)) for i in range(2)]
         share = results["lost_surface_mass"]
@@ -154,7 +175,7 @@ def _draw_panel(panel: Any, rows: Sequence[Row], values: list[float], theme: The
     chosen = choose(rows)
     for number, (family, name) in enumerate(NAMES.items()):
         points = sorted(
-            (row["bytes"] / 1000, value, row["size"])
+            (stored_bytes(row) / 1000, value, row["size"])
             for row, value in zip(rows, values)
             if row["family"] == family
         )
@@ -166,7 +187,7 @@ def _draw_panel(panel: Any, rows: Sequence[Row], values: list[float], theme: The
         for kilobytes, value, cells in (points[0], points[-1]) if family == "grid" else ():
             place = (kilobytes, value)
             panel.annotate(f"{cells}$^3$", place, xytext=(0, 10), fontsize=10, **beside)
-    place = next((row["bytes"] / 1000, v) for row, v in zip(rows, values) if row is chosen)
+    place = next((stored_bytes(row) / 1000, v) for row, v in zip(rows, values) if row is chosen)
     ring = {"markerfacecolor": "none", "markeredgecolor": theme.ink, "markeredgewidth": 2}
     panel.plot(*place, marker="o", markersize=19, **ring)
     bold = {"fontsize": 11, "fontweight": "bold"}
@@ -183,11 +204,13 @@ def _draw_panel(panel: Any, rows: Sequence[Row], values: list[float], theme: The
 def circumstances(results: Mapping[str, Any]) -> str:
     """What was measured, in a line or two."""
     machine, scene = results["machine"], results["scene"]
+    full = [row["size"] for row in results["representations"] if row["kept_volume"] >= 1.0]
+    left_out = f" (not drawn, as they keep all: {', '.join(full)})" if full else ""
     where = f"{machine['cores']} CPU cores" if machine["device"] == "cpu" else machine["device"]
     return (
         f"{scene['name']}, {scene['train_images']} photographs; one field of "
-        f"{results['learn_steps']} steps teaches all; {results['rays']} held-out rays; {where}.\n"
-        "Gates in bfloat16, grids one bit a cell; down and left is better. "
+        f"{results['learn_steps']} steps teaches all; {results['rays']} held-out rays; {where}. "
+        f"Gates in bfloat16, grids as octrees{left_out}; down and left is better. "
         "Ten times the bytes of the chosen save less than a third."
     )
 

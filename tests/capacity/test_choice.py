@@ -8,12 +8,14 @@ import pytest
 
 from leco_plugin.capacity.choice import (
     WORTH_TEN_TIMES,
+    best_gate,
     choose,
     common_volume,
     grid_that_nearly_suffices,
     grid_that_suffices,
     kilobytes,
     smallest_grid,
+    stored_bytes,
     verdict,
 )
 from leco_plugin.capacity.measuring import VOLUMES
@@ -46,7 +48,7 @@ def test_what_the_scene_needs_is_said_beside_the_grid_that_keeps_as_little() -> 
     assert smallest_grid(rows, SMALL_GATE) is FINE and grid_that_suffices(rows) is None
     said = verdict(rows)
     assert said.startswith("This scene needs 3.0 kB: a gate on frequencies keeps 6.2%")
-    assert "256^3 cells, 699 times" in said
+    assert "256^3 cells, 699.1 times" in said
 
 
 def test_a_grid_that_suffices_is_named() -> None:
@@ -54,6 +56,19 @@ def test_a_grid_that_suffices_is_named() -> None:
     rows = [SMALL_GATE, LARGE_GATE, enough, FINE]
     assert choose(rows) is grid_that_suffices(rows) is enough
     assert verdict(rows).startswith("A grid suffices: 16^3 cells")
+
+
+def test_a_grid_has_the_bytes_of_its_octree_where_they_are_known() -> None:
+    small = COARSE | {"size": "64", "octree_bytes": 800, "kept_volume": 0.075}
+    rows = [SMALL_GATE, LARGE_GATE, small]
+    assert choose([SMALL_GATE, small | {"octree_bytes": 3_000}]) is SMALL_GATE
+    assert choose(rows) is small and best_gate(rows) is SMALL_GATE
+    assert verdict(rows) == (
+        "A grid suffices: 64^3 cells, 0.8 kB as an octree, keeps 7.5% of the volume; the gate "
+        "that pays most, 3.0 kB, 6.2%."
+    )
+    everything = COARSE | {"octree_bytes": 0, "kept_volume": 1.0}
+    assert choose([everything, SMALL_GATE]) is SMALL_GATE and stored_bytes(everything) == 1
 
 
 def test_a_usual_grid_that_keeps_as_little_as_a_smaller_gate_suffices() -> None:
