@@ -25,13 +25,15 @@ from leco_plugin.chart.methods import contenders
 from leco_plugin.evaluation.queries import WARM_UP
 from leco_plugin.hosts.guided import GuidedModelConfig
 from leco_plugin.hosts.guided_start import OWN_SAMPLER
+from leco_plugin.models.leco_config import LecoModelConfig
+from leco_plugin.models.sizing.sizes import SMALL
 from leco_plugin.models.switch.field import SwitchNerfModelConfig
 from leco_plugin.samplers.registry import sampler_spec
 from leco_plugin.scenes.pixels.known_distances import KnownDistancePixelSamplerConfig
 
 PAGE = ROOT / "docs" / "gifts.md"
 WORDS = {"yes": "given", "-": "not"}
-HOSTS = ["leco-ngp", "leco-nerfacto", "leco-switch-nerf"]
+HOSTS = ["leco-ngp", "leco-nerfacto", "leco-switch-nerf", "leco-mega-nerf"]
 HEAD = f"""# Who gets what
 
 All rows of a chart train for the same time on the same photographs. This page says what else each
@@ -45,12 +47,19 @@ learned-occupancy-without-gifts` charts a learned row without them; a stored one
   keeps the whole box at first, and is opaque by itself.
 - **Careful start**: skipping begins at a lower threshold, and its price is watched.
 - **Warm-up**: a grid asks all of its cells at first, for at most 1/{1 / WARM_UP:.0f} of a run.
-- **Rates** and **batch**: learning rates of the host, and what it shades in a step.
+- **Rates** and **batch**: learning rates of the host, and what it shades in a step on a CPU.
+- **Table**: entries of a level of the field's hash table, on a CPU.
 - **Codes**: small ones begin at zero. Those of nerfstudio cost test views several dB.
 - **Front to back**: images leave out what lies behind opaque surfaces. *guided*: where that is
   faster.
 - **Loss of colours**: `leco-occupancy` in all its rows weighs errors in hue eight times, each host
   keeps its own loss in all of its rows.
+- **Across methods** only time, photographs, threads and codes are equal. Fields, losses, batches
+  and bounds are each method's own; LeCO also renders in C, and has the largest table. What a gate
+  gains is seen between rows of one method.
+
+No sweep of the rivals' rates and sizes is stored: they have nerfstudio's rates, and sizes that a
+step on a CPU can pay.
 
 This page is generated: `python benchmarks/reference_pages.py`.
 """
@@ -133,6 +142,7 @@ def gifts_of(contender: Contender) -> dict[str, str]:
         "warm-up": _warm_up(model, host) if guided else "-",
         "rates": ", ".join(rates),
         "batch": _batch(pipeline),
+        "table": _table(host),
         "codes": model.codes if guided else "small",
         "front to back": {True: "yes", None: "guided"}.get(getattr(model, "front_to_back", 0), "-"),
     }
@@ -140,9 +150,19 @@ def gifts_of(contender: Contender) -> dict[str, str]:
 
 def _batch(pipeline: Any) -> str:
     """Samples or rays of a training step."""
-    samples = getattr(pipeline, "target_num_samples", None)
-    rays = pipeline.datamanager.train_num_rays_per_batch
-    return f"{rays} rays" if samples is None else f"{samples} samples"
+    samples, model = getattr(pipeline, "target_num_samples", None), pipeline.model
+    rays = f"{pipeline.datamanager.train_num_rays_per_batch} rays"
+    if isinstance(model, LecoModelConfig) and model.schedule.freeze and not model.homogeneous:
+        rays += f", up to {SMALL.guided_batch:g} times as many where samples are skipped"
+    return rays if samples is None else f"{samples} samples"
+
+
+def _table(host: Any) -> str:
+    """Entries of a level of its field's hash table."""
+    if isinstance(host, LecoModelConfig):
+        return f"by the scene, up to 2^{SMALL.field.encoding.log2_table}"
+    entries = getattr(host, "log2_hashmap_size", None)  # none where a field has no table
+    return "-" if entries is None else f"2^{entries}"
 
 
 def _warm_up(model: GuidedModelConfig, host: Any) -> str:

@@ -174,7 +174,7 @@ def packing_consistent(case: EstimatorCase) -> None:
 
 @checks("stratified-in-training", "estimator")
 def stratified_in_training(case: EstimatorCase) -> None:
-    """Samples shift by a share of a step in training, which is uniform over the rays."""
+    """Samples shift by a share of a step in training, uniform over the rays and of each alone."""
     check_shifts(case)
     sampler, rays = case.shared(EVERYTHING).train(), crossing(MANY)
     ray_indices, t_starts, _ = in_order(case.sample(sampler, rays, render_step_size=LONG_STEP))
@@ -186,7 +186,8 @@ def stratified_in_training(case: EstimatorCase) -> None:
 def _check_uniform(shares: Tensor) -> None:
     """Raises unless numbers [N] are spread over [0, 1) as uniform random numbers are.
 
-    By the statistic of Kolmogorov and Smirnov, which for these exceeds 4 / sqrt(N) once in 10^13.
+    By the statistic of Kolmogorov and Smirnov, which for these exceeds 4 / sqrt(N) once in 10^13,
+    and the correlation of neighbours, which exceeds 6 / sqrt(N) once in 10^8.
     """
     from scipy.stats import ks_1samp, uniform
 
@@ -197,6 +198,11 @@ def _check_uniform(shares: Tensor) -> None:
         apart <= bound,
         f"the shifts of {n} rays, in steps, are {apart:.2g} away from uniform random numbers, "
         f"which are {bound:.2g} away at most",
+    )
+    alike = abs(float(torch.corrcoef(torch.stack([shares[:-1], shares[1:]]))[0, 1]))
+    require(
+        alike <= 1.5 * bound,
+        f"the shifts of rays beside each other correlate by {alike:.2g}; each ray has its own",
     )
 
 

@@ -99,6 +99,13 @@ class OneJitter(Jittered):
         return torch.rand(()).expand(n_rays)
 
 
+class SharedByTwo(Jittered):
+    """Every other ray is shifted as the one before it."""
+
+    def shares(self, n_rays: int) -> Tensor:
+        return torch.rand((n_rays + 1) // 2).repeat_interleave(2)[:n_rays]
+
+
 class HalfAStep(Jittered):
     """What lies in the second half of a step is never where a sample begins."""
 
@@ -120,7 +127,7 @@ MUTANTS: dict[str, tuple[type, ...]] = {
         WithoutFarPlaneInTraining,
     ),
     "packing-consistent": (OffsetForgotten,),
-    "stratified-in-training": (OneJitter, HalfAStep, NearerByPreference),
+    "stratified-in-training": (OneJitter, SharedByTwo, HalfAStep, NearerByPreference),
     SKIPS: (PiecesOfTheFirst, ShortRunsDropped, FirstRunOnly),
 }
 """By the rule that must fail."""

@@ -98,6 +98,13 @@ def test_without_its_package_flip_is_left_out_with_one_warning(
     assert len(caught) == 1 and all(one.keys() == {"psnr", "ssim"} for one in found)
 
 
+def test_flip_is_of_what_a_screen_shows() -> None:
+    predicted, truth = images()
+    outside = 3.0 * predicted - 1.0
+    assert metrics.flip(outside, truth) == metrics.flip(outside.clamp(0, 1), truth) != 0.0
+    assert metrics.flip(truth, outside) == metrics.flip(truth, outside.clamp(0, 1))
+
+
 def test_lpips_is_that_of_torchmetrics(backbone: Path) -> None:
     predicted, truth = images()
     metric = metrics.lpips_metric("alex")

@@ -63,19 +63,22 @@ def test_full_leaves_the_validation_pictures_out(scene: Path) -> None:
     assert scored.cameras.width.flatten().tolist() == [6, 6]
 
 
-def test_the_right_half_is_seen_by_a_camera_of_half_the_width(scene: Path) -> None:
-    """Its rays are those of the right half of the whole picture's camera."""
-    halves = parse(scene, "test", val_scale_factor=2)
-    whole = parse(scene, "test", protocol="full", val_scale_factor=2)
+@pytest.mark.parametrize(("factor", "shape", "left"), [(2, (8, 6), 6), (8, (2, 2), 1)])
+def test_the_right_half_is_seen_by_a_camera_of_half_the_width(
+    scene: Path, factor: int, shape: tuple[int, int], left: int
+) -> None:
+    """Its rays are those of the right half of the whole picture's camera: of 3 columns, 2."""
+    halves = parse(scene, "test", val_scale_factor=factor)
+    whole = parse(scene, "test", protocol="full", val_scale_factor=factor)
     assert halves.mask_filenames is None
     for number in range(2):
         rays = halves.cameras.generate_rays(number, keep_shape=True)
         others = whole.cameras.generate_rays(number, keep_shape=True)
-        assert rays.shape == (8, 6)
-        torch.testing.assert_close(rays.directions, others.directions[:, 6:])
+        assert rays.shape == shape
+        torch.testing.assert_close(rays.directions, others.directions[:, left:])
         image = InputDataset(halves).get_data(number, "uint8")["image"]
         other = InputDataset(whole).get_data(number, "uint8")["image"]
-        assert torch.equal(image, other[:, 6:])
+        assert torch.equal(image, other[:, left:])
 
 
 def test_rays_are_those_of_the_format(scene: Path) -> None:
