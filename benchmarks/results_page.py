@@ -219,13 +219,17 @@ def growth_section() -> list[str]:
     grown = [measured[one.name] for one in cities(measured)]
     if len(grown) < 2:
         return []
-    command = "leco city --blocks K --aerial-only --out city-K; leco capacity --data city-K ..."
+    steps = grown[0]["learn_steps"]
+    command = (
+        "leco city --blocks K --aerial-only --out city-K; leco capacity --data city-K --out DIR "
+        f"--learn-steps {steps}"
+    )
     note = (
         f" Each representation loses {grown[0]['lost_surface_mass']:.1%} of the weight near "
         "surfaces along held-out rays; kept is a share of the volume that training "
-        "rays reach. One field teaches all of a city, learned in "
-        f"{grown[0]['learn_steps']} steps. The best grid is the smallest of those that keep "
-        "least, within 5%; an octree holds the same cells."
+        f"rays reach. One field teaches all of a city, learned in {steps} steps. Gate and grid are "
+        "chosen by one rule: ten times the bytes, of a grid as an octree, must leave two thirds of "
+        "the volume."
     )
     title = "How occupancy grows with a city"
     head, *rest = section(title, command, grown[0], growth_table(measured), note)

@@ -12,6 +12,8 @@ from sizes_tables import capacity_table, samples_table, shrink_table, sizes_tabl
 
 CAPACITY = "capacity-"
 """How the names of pictures of `leco capacity` begin."""
+CITY_STEPS = 800
+"""Of the fields of cities; elsewhere as many as the command has by default."""
 
 
 def sizes_sections() -> list[str]:
@@ -62,11 +64,13 @@ def sizes_sections() -> list[str]:
         rows = [row for report in measured.values() for row in report["representations"]]
         note = (
             f" Each loses {first['lost_surface_mass']:.1%} of the weight near surfaces along "
-            "held-out rays; kept is a share of the volume that training rays reach. The "
-            "last column: whether such a gate keeps no more than the grid. "
-            f"Rows {made_line(rows)}."
+            "held-out rays; kept is a share of the volume that training rays reach. Gate and grid "
+            "are those that pay most of their kind: ten times the bytes must leave two thirds of "
+            f"the volume. One field a scene: small differences mean nothing. Cities: add "
+            f"`--learn-steps {CITY_STEPS}`. In the pictures, lines go from few bytes to many: left "
+            f"what each keeps, right what each loses. Rows {made_line(rows)}."
         )
-        command = "leco capacity --data SCENE --out DIR --json results/capacity/SCENE.json"
+        command = "leco capacity --data SCENE --out DIR"
         title = "How much a scene needs: gates and grids at equal loss"
         head, *rest = section(title, command, first, capacity_table(measured), note)
         noted = [f"**{notes()['capacity']}**\n"] if "capacity" in notes() else []

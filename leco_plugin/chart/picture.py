@@ -111,7 +111,8 @@ def _draw_occupancies(figure: Any, top: float, shown: Shown, theme: Theme) -> No
     above[0].set_ylabel("space kept, %")
     draw_panel(above[0], replace(first, title="" if by_psnr else SIZE), theme)
     if first.points:
-        places, names = zip(*(((one.x, one.y), one.name) for one in first.points))
+        places = [(one.x, one.y) for one in first.points]
+        names = [one.name.replace("taught grid", "taught") for one in first.points]
         colours = [look_of(one, theme)["color"] for one in first.points]
         seeds = [seed for one in first.points for seed in one.seeds]
         name_points(above[0], places, names, colours, seeds)
