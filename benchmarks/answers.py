@@ -75,9 +75,9 @@ def _answer(charts: Sequence[tuple[str, dict[str, Any]]]) -> list[str]:
     for (name, results), row in zip(charts, cells):
         scene = _link(results) + (" (*)" if name in noted else "")
         shown = [row.get(column, "-") for column in columns]
-        rows.append([scene, *shown, _answer_of(results)])
+        rows.append([scene, *shown, _answer_of(results), str(results["made"]["date"])])
     counted = f"{in_short([results for _, results in charts])}\n"
-    return [figures, *table(f"scene | {' | '.join(columns)} |", rows), "", counted]
+    return [figures, *table(f"scene | {' | '.join(columns)} | | made", rows), "", counted]
 
 
 def in_short(charts: Sequence[Mapping[str, Any]]) -> str:

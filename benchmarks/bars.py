@@ -196,7 +196,10 @@ def of_kills(folder: Path) -> list[str]:
     said = (
         f"{sum(lost)} of {len(lost)} kills lost something; {gone_on} of {killed} runs ended frozen"
     )
-    return [asked, said, "yes" if not any(lost) and gone_on == killed else "**no**", "`kills`"]
+    old = noted(folder).get("kills")
+    said += f". {old.rstrip('.')}" if old else ""
+    reached = "yes" if not any(lost) and gone_on == killed else "**no**"
+    return [asked, said, reached, "`kills` (*)" if old else "`kills`"]
 
 
 def of_cards(folder: Path) -> list[str]:
