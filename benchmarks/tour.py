@@ -30,8 +30,8 @@ STEPS = 8
 """Frames from one photograph to the next."""
 FRAME = 140
 """Milliseconds."""
-COLOURS = 64
-"""Of a frame, so that a page may hold the film."""
+COLOURS = 128
+"""Of all frames together, so that a page may hold the film."""
 CANDIDATES, BISECTIONS = 384, 6
 """Of a ray, and halvings of the way from one to the next."""
 RAYS_AT_ONCE = 8192

@@ -30,8 +30,8 @@ STILL, MOST_FRAMES = 4, 12
 """Looks in a still picture of a history, and in one that moves."""
 FRAME_PIXELS = 300
 """Along the longer side of a slice."""
-FRAME_COLOURS = 48
-"""Of a picture that moves, so that a page may hold it."""
+FRAME_COLOURS = 255
+"""Of a picture that moves, the same in all its frames; GIF keeps one more for what stays."""
 FRAME, LAST_FRAME = 250, 3000
 """Milliseconds for which a frame is shown."""
 DPI = 80
@@ -68,9 +68,20 @@ def draw_history(occupancy: Occupancy, folder: Path, path: Path) -> Path:
 def write_film(
     frames: Sequence[Image.Image], path: Path, durations: int | list[int], colours: int
 ) -> None:
-    """Writes a GIF that begins anew at its end, with durations in milliseconds, and few colours
-    without noise, which GIF cannot compress."""
-    few = [frame.quantize(colours, dither=Image.Dither.NONE) for frame in frames]
+    """Writes a GIF that repeats. All frames share one palette, so that a colour never changes.
+
+    Args:
+        frames: RGB pictures of one size.
+        durations: in milliseconds, of all frames or of each.
+        colours: in the palette. There is no dither, which GIF cannot compress.
+    """
+    width, height = frames[0].size
+    strip = Image.new("RGB", (width, height * len(frames)))
+    for number, frame in enumerate(frames):
+        strip.paste(frame, (0, height * number))
+    tree = Image.Quantize.FASTOCTREE  # the others mix the colours of thin lines with their paper
+    palette = strip.quantize(colours, method=tree, dither=Image.Dither.NONE)
+    few = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     few[0].save(path, save_all=True, append_images=few[1:], duration=durations, loop=0)
 
 
@@ -135,7 +146,7 @@ class _Film:
             for row, axes in enumerate(left):
                 self._draw_slice(axes, row, look)
             self._draw_lines(right[0], right[1], look)
-            figure.suptitle(f"learning what is empty: step {self.history.steps[look]}")
+            figure.suptitle(f"Learning what is empty: step {self.history.steps[look]}")
             yield figure
 
     def _draw_slice(self, axes: Any, row: int, look: int) -> None:

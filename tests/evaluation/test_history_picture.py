@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 from ball_occupancy import ball
-from PIL import Image
+from PIL import Image, ImageColor
 
+from leco_plugin.chart.theme import LIGHT
 from leco_plugin.cli import main
 from leco_plugin.evaluation import history_picture
 from leco_plugin.evaluation.history_picture import spread_evenly
@@ -42,6 +43,29 @@ def test_a_gif_has_a_frame_for_each_look_and_rests_on_the_last(run: Path) -> Non
         first, seen = film.convert("RGB").tobytes(), film.info["duration"]
         film.seek(2)
         assert film.convert("RGB").tobytes() != first and film.info["duration"] > 4 * seen
+
+
+def test_a_colour_is_the_same_in_every_frame_of_a_film(tmp_path: Path) -> None:
+    """Thin lines beside many other colours, which differ from frame to frame."""
+    lines = [ImageColor.getrgb(colour) for colour in LIGHT.colours[:5]]
+    frames = []
+    for look in range(3):
+        gradient = Image.linear_gradient("L").rotate(90 * look)
+        frame = Image.merge("RGB", (gradient, gradient.rotate(90), Image.new("L", (256, 256), 99)))
+        for number, colour in enumerate(lines):
+            frame.paste(colour, (0, 10 * number, 256, 10 * number + 2))
+        frames.append(frame)
+    history_picture.write_film(frames, tmp_path / "film.gif", 100, history_picture.FRAME_COLOURS)
+    with Image.open(tmp_path / "film.gif") as film:
+        shown = []
+        for look in range(film.n_frames):
+            film.seek(look)
+            picture = film.convert("RGB")
+            shown.append([picture.getpixel((128, 10 * number)) for number in range(len(lines))])
+    assert len(shown) == 3 and shown[0] == shown[1] == shown[2]
+    for wanted, seen in zip(lines, shown[0]):
+        assert isinstance(seen, tuple)
+        assert max(abs(a - b) for a, b in zip(wanted, seen)) <= 8
 
 
 def test_a_long_history_is_shown_from_its_first_look_to_its_last(
