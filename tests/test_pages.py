@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import os
 import re
 import shlex
@@ -204,6 +205,25 @@ def test_pages_of_commands_and_options_are_those_of_the_code() -> None:
     assert TEXTS["options"] == reference_pages.options_page()
     assert TEXTS["conformance"] == reference_pages.rules_page()
     assert TEXTS["gifts"] == gifts_page.page()
+
+
+def test_the_size_of_a_file_is_told_alike_on_all_pages_and_is_that_of_stored_runs() -> None:
+    said = r"The file takes (\d+) to (\d+) kB where a small gate took over late in the run, and "
+    said += r"(\d+) to (\d+) kB otherwise\."
+    pages = [TEXTS[name] for name in ("architecture", "share", "file-format", "CHANGELOG")]
+    pages.append((ROOT / "docs" / "upstream" / "leco_nerf.md").read_text())
+    (ranges,) = {re.findall(said, " ".join(text.split()))[0] for text in pages}
+    low, high, others_low, others_high = (1000 * int(value) for value in ranges)
+    runs = [
+        run["occupancy"]
+        for file in sorted((ROOT / "benchmarks" / "results" / "charts").glob("*.json"))
+        for run in json.loads(file.read_text())["runs"]
+        if run["sampler"] == "learned-occupancy" and run.get("occupancy")
+    ]
+    small = [run["bytes"] for run in runs if run["params"] < 10_000]
+    others = [run["bytes"] for run in runs if run["params"] >= 10_000]
+    assert small and low <= min(small) and max(small) <= high
+    assert others and others_low <= min(others) and max(others) <= others_high
 
 
 def test_a_contender_that_lacks_a_gift_is_named_on_the_page_of_gifts() -> None:
