@@ -21,10 +21,10 @@ CHARTS = {
 """Which stored chart shows a method on a survey by drone."""
 HEAD = "Method | Trained for | Sampling | Memory | PSNR | Rendering an image"
 BELOW = r"""
-75 drone photographs of a building site (OpenDroneMap's `odm_data_caliterra`, 480 x 360), on two CPU
-cores. Memory is the most that the process held, a median. PSNR is of test photographs: the mean of
-{seeds} seeds, with the least and the most. A method marked (\*) has a chart that was made before a
-later change."""
+75 drone photographs of a building site (OpenDroneMap's `odm_data_caliterra`, 480 x 360), on one CPU
+core each. Memory is the most that the process held, a median. PSNR is of test photographs: the mean
+of {seeds} seeds, with the least and the most. A method marked (\*) has a chart that was made before
+a later change."""
 
 
 def page(text: str) -> str:
