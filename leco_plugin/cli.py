@@ -46,7 +46,7 @@ def city(
 ) -> None:
     """Write the procedural city as a scene to train on, with its exact geometry.
 
-    A run that was killed goes on where it ended when the same is asked for again.
+    A killed run resumes when the same command is typed again.
 
     Args:
         out: Folder to write. If it holds just this city, nothing is done.
@@ -96,8 +96,8 @@ def poses(
 ) -> None:
     """Find where photographs were taken, and write them as a scene to train on.
 
-    Runs COLMAP on the CPU, by `pip install 'leco_plugin[poses]'`. The scene is upright, and in
-    metres where EXIF has GPS. A run that was killed goes on when the same is asked for again.
+    Runs COLMAP on the CPU, by `pip install 'leco-plugin[poses]'`. The scene is upright, and in
+    metres where EXIF has GPS. A killed run resumes when the same command is typed again.
 
     Args:
         photos: Folder of the photographs, with those below it. They are only read.
@@ -125,7 +125,7 @@ def points(
 ) -> None:
     """Give a scene that has poses and no sparse points some, which say where its surfaces lie.
 
-    Runs COLMAP on the CPU, by `pip install 'leco_plugin[poses]'`, from the poses and lenses of the
+    Runs COLMAP on the CPU, by `pip install 'leco-plugin[poses]'`, from the poses and lenses of the
     scene, which stay as they are. Writes leco_points.ply into the scene and names it in
     transforms.json. The file as it was stays beside it as transforms.before_points.json.
 

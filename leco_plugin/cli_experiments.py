@@ -86,8 +86,7 @@ def stability(
 
     Writes stability.json, table.md, stability.png, stability-dark.png, and for each failure a
     picture in failures. What is finished is kept whenever this is stopped; the same command goes on
-    with what is missing. Exit 0 whatever the verdicts are; 1 says that the case that must fail did
-    not fail by its figures, so that no verdict can be believed.
+    with what is missing. Exits with 1 if the case that must fail passes: then no verdict counts.
 
     Args:
         out: Folder of the table. More cases, samplers and seeds may be added to it later.

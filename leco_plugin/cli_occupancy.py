@@ -172,9 +172,9 @@ def shrink(
         file: An occupancy.safetensors, best where its run left it, or a folder of runs: the newest.
         data: The scene that it was learned on.
         out: File for the smaller occupancy.
-        lost_surface_mass: Most of the weight near surfaces that it may declare lost, the original's
-            share included; without a run, most of the original's decisions.
-        image_price: Most dB that it may declare, the original's share included.
+        lost_surface_mass: Largest share of the weight near surfaces that it may lose, the
+            original's loss included; without a run, of the original's decisions.
+        image_price: Largest loss of PSNR in dB, the original's included.
         picture: File for a picture of the gates that were tried.
         json: File for the gates that were tried and the one that was chosen, as JSON; each is
             written when it was tried, so that a search that is stopped leaves those.

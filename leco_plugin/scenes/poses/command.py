@@ -62,9 +62,9 @@ def make_scene(
 ) -> dict[str, Any]:
     """Makes a scene of photographs, unless `out` already holds it; returns the report.
 
-    A run that was killed goes on where it ended when the same is asked for again. Features are
-    looked for at a longest side of `size` pixels; 0 threads are all of the CPU. InputError if `out`
-    holds something else, or the photographs cannot be used; ImportError without pycolmap.
+    A killed run resumes when the same is asked for again. Features are looked for at a longest
+    side of `size` pixels; 0 threads are all of the CPU. InputError if `out` holds something else,
+    or the photographs cannot be used; ImportError without pycolmap.
     """
     require(size >= 100, "size", size, "100 pixels or more")
     require(threads >= 0, "threads", threads, "0 for all, or a number of them")
