@@ -90,6 +90,12 @@ def headline(results: Results) -> str:
     return f"{QUICKLY}: {counted}" if results.get("sizes") == asdict(QUICK) else counted
 
 
+def titles(results: Results) -> tuple[str, str]:
+    """The headline in two lines, each with a capital at its beginning."""
+    title, _, below = headline(results).partition("; ")
+    return title[:1].upper() + title[1:], below[:1].upper() + below[1:]
+
+
 def _count_passes(results: Results) -> str:
     cells = [cell for row in results["cases"] for cell in row["cells"].values()]
     compared = [one for one in results["samplers"] if one["reference"] is not None]
@@ -178,7 +184,7 @@ def draw(results: Results, path: Path, theme: Theme = LIGHT) -> Path:
     axes: Any = figure.add_axes((0, 0, 1, 1))
     axes.set(xlim=(0, width), ylim=(height, 0))
     axes.axis("off")
-    title, _, others = headline(results).partition("; ")
+    title, others = titles(results)
     title, below = textwrap.fill(title, int(width * 8.6)), textwrap.fill(others, int(width * 11))
     axes.text(0.15, 0.12, title, va="top", color=theme.ink, fontsize=14, fontweight="bold")
     low = 0.12 + 0.28 * (title.count("\n") + 1)

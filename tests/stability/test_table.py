@@ -8,7 +8,15 @@ from typing import Any
 import pytest
 
 from leco_plugin.stability.plan import FULL, QUICK
-from leco_plugin.stability.table import QUICKLY, blind, headline, is_unproven, table, verdicts_of
+from leco_plugin.stability.table import (
+    QUICKLY,
+    blind,
+    headline,
+    is_unproven,
+    table,
+    titles,
+    verdicts_of,
+)
 
 SAMPLERS = [
     {"name": "learned", "title": "learned occupancy", "reference": "dense"},
@@ -125,3 +133,9 @@ def test_a_cell_says_what_its_seeds_were() -> None:
     shown = results(("yard", False, {"learned": one}))
     assert headline(shown).endswith("; 2 seeds of cells are missing")
     assert all(said in table(shown) for said in ("3 of 5 seeds", "worst -0.40", "healed 3 x"))
+
+
+def test_the_lines_over_the_picture_begin_with_a_capital() -> None:
+    title, below = titles(TWO)
+    assert title[0].isupper() and f"{title}; {below}".lower() == headline(TWO).lower()
+    assert titles(results()) == ("Nothing has been run yet", "")
