@@ -253,6 +253,11 @@ def _lines_of(gift: str, rows: list[Contender]) -> list[str]:
     ]
 
 
+def _prose(page: str) -> str:
+    """A page of the site without its scripts and code."""
+    return re.sub(r"<(script|style|code)\b.*?</\1>", "", page, flags=re.DOTALL)
+
+
 def test_the_site_builds_without_a_warning_and_fetches_nothing(tmp_path: Path) -> None:
     """Every link and heading of the site is there; nothing that a page loads is elsewhere."""
     pytest.importorskip("mkdocs")
@@ -262,6 +267,9 @@ def test_the_site_builds_without_a_warning_and_fetches_nothing(tmp_path: Path) -
     assert done.returncode == 0, done.stderr
     site = {path.name: path.read_text() for path in tmp_path.glob("*.html")}
     assert site.keys() >= {"index.html", "tutorial.html"} and "decisions.html" not in site
+    dead = re.compile(r"<abbr[^>]*>(?:entry|figures|why)<|\((?:entry|figures|why)\)")
+    assert [name for name, page in site.items() if dead.search(_prose(page))] == []
+    assert "docs/decisions.md" in site["method.html"]
     assert "Occupancy.load" in site["python.html"] or "load(path" in site["python.html"]
     loaded = re.compile(
         r"<(?:script|link|img|source|iframe)\b[^>]*(?:src|href|srcset)=\"?([^\s\">]+)"
