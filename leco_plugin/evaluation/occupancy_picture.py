@@ -32,6 +32,8 @@ CELLS = 128
 """Along the longest side, for the points in space."""
 PIXELS = 640
 """Along the longer side of a slice."""
+DPI = 160
+"""Pixels an inch of a picture, so that its letters can be read at the width of a page."""
 MOST_POINTS = 50_000
 HORIZONTAL = (0.12, 0.4)
 """Heights of the horizontal slices, as shares of the way from the ground to the highest roofs:
@@ -67,7 +69,7 @@ def draw(
     low, high = heights_seen_from_above(occupancy, box)
     points, normals = surface_points(occupancy, box, low)
     ground = None if colours is None else seen_from_above(occupancy, box, colours)
-    figure = new_figure((15, 9.4), layout="constrained")
+    figure = new_figure((10.5, 6.4), layout="constrained")
     wide, tall = (box.high - box.low)[[0, 2]].tolist()
     ratios = (1.0, min(1.0, max(0.5, 1.6 * tall / wide)))
     grid = figure.add_gridspec(2, 6, height_ratios=ratios, hspace=0.04)
@@ -85,10 +87,12 @@ def draw(
     colour_bar = figure.colorbar(shown, ax=figure.axes[2:4], shrink=0.9, pad=0.01, fraction=0.03)
     colour_bar.ax.axhline(occupancy.threshold, color=CONTOUR, linewidth=2)
     colour_bar.set_label("o(x)")
+    figure.suptitle(headline(occupancy), fontsize=15, fontweight="bold", x=0.01, ha="left")
     lines = title_of(occupancy), _legend(occupancy, cameras, ground is not None)
-    figure.suptitle("\n".join(" · ".join(parts) for parts in lines), fontsize=12)
+    below = "\n".join(" · ".join(parts) for parts in lines)
+    figure.supxlabel(below, fontsize=10, x=0.01, ha="left")
     kind = Path(path).suffix[1:].lower()
-    write_whole(Path(path), lambda file: figure.savefig(file, format=kind or None, dpi=110))
+    write_whole(Path(path), lambda file: figure.savefig(file, format=kind or None, dpi=DPI))
     return Path(path)
 
 
@@ -144,9 +148,9 @@ def draw_slice(
         axes.scatter(x, y, s=9, c=CAMERA, edgecolors="black", linewidths=0.3, label="cameras")
         axes.set(xlim=extent[:2], ylim=extent[2:])
     drawn = f", {AXES[up]} drawn {longer:.1f} times as long" if longer > 1.0 else ""
-    axes.set_title(f"o(x) at {AXES[normal]} = {at:.4g}{drawn}", fontsize=10)
+    axes.set_title(f"o(x) at {AXES[normal]} = {at:.4g}{drawn}", fontsize=11)
     axes.set(xlabel=AXES[across], ylabel=AXES[up])
-    axes.tick_params(labelsize=8)
+    axes.tick_params(labelsize=9)
     return shown
 
 
@@ -248,9 +252,9 @@ def _draw_points(axes: Any, points: Tensor, normals: Tensor, heights: tuple[floa
 
     axes.set_axis_off()
     if len(points) == 0:
-        axes.set_title("no surface: all of this is kept, or nothing", fontsize=10)
+        axes.set_title("no surface: all of this is kept, or nothing", fontsize=11)
         return
-    axes.set_title(f"{len(points)} kept points, coloured by height", fontsize=10)
+    axes.set_title(f"{len(points)} kept points, coloured by height", fontsize=11)
     low, high = heights
     shares = ((points[:, 2] - low) / max(high - low, 1e-9)).clamp(0, 1)
     light = torch.nn.functional.normalize(torch.tensor([0.35, -0.55, 0.75]), dim=0)
@@ -262,6 +266,14 @@ def _draw_points(axes: Any, points: Tensor, normals: Tensor, heights: tuple[floa
         (points.amax(dim=0) - points.amin(dim=0)).clamp(min=1e-6).tolist(), zoom=1.4
     )
     axes.view_init(elev=38, azim=-58)
+
+
+def headline(occupancy: Occupancy) -> str:
+    """The title of a picture, in ten words at most."""
+    skipped = occupancy.report.get("empty_fraction")
+    if isinstance(skipped, float):
+        return f"This occupancy skips {skipped:.1%} of all candidates"
+    return f"An occupancy of {occupancy.num_params:,} parameters"
 
 
 def title_of(occupancy: Occupancy) -> list[str]:

@@ -16,6 +16,7 @@ from PIL import Image
 from leco_plugin.evaluation.inspection import ViewBox, cameras_of, describe, exposed, whole_box
 from leco_plugin.evaluation.occupancy_picture import (
     draw,
+    headline,
     heights_seen_from_above,
     interesting_box,
     surface_points,
@@ -111,3 +112,11 @@ def test_exposed_cells_are_those_with_a_skipped_neighbour() -> None:
         free = not all(bool(kept[p]) for p in inside)
         assert bool(open_ended[x, y, z]) == (bool(kept[x, y, z]) and free)
         assert bool(found[x, y, z]) == (bool(kept[x, y, z]) and (free or len(inside) < 6))
+
+
+def test_the_title_of_a_picture_has_ten_words_at_most() -> None:
+    assert (
+        headline(with_report(empty_fraction=0.739))
+        == "This occupancy skips 73.9% of all candidates"
+    )
+    assert all(len(headline(one).split()) <= 10 for one in (ball(), with_report()))
