@@ -1,4 +1,4 @@
-"""Draws the package: each module by its lines, each folder (a room), and the imports between rooms.
+"""Draws the package: its folders (rooms) by their lines, and how many imports lead between them.
 
 python benchmarks/house.py [--out FILE]        # docs/house.svg by default
 """
@@ -9,21 +9,22 @@ import argparse
 import ast
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import checkout  # noqa: F401
 import matplotlib.pyplot as plt
-from matplotlib.patches import FancyArrowPatch, Rectangle
+from matplotlib.patches import Rectangle
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = "leco_plugin"
 OUT = ROOT / "docs" / "house.svg"
-LINES_AN_INCH = 900.0
 GROUND = ("space", "occupancy", "log", "entries")
 """Files beside the rooms that others stand on; the rest of them are commands and methods."""
 STYLE = {"svg.hashsalt": PACKAGE}
 """Makes the identifiers in the file the same in every drawing."""
-WIDTH, GAP = 1.75, 0.75
-"""Of a room, and between two columns, inches."""
+CELL, NAMES, HEAD, MARGIN = 0.46, 3.1, 1.75, 0.6
+"""Inches: side of a square, width of the names beside them, height of what stands above, and what
+the last name takes on the right."""
 
 
 def modules(root: Path = ROOT) -> dict[str, Path]:
@@ -88,8 +89,8 @@ def depths(edges: Counter[tuple[str, str]], rooms: set[str]) -> dict[str, int]:
 def draw(out: Path = OUT) -> None:
     """Writes the picture as SVG; the same package gives the same bytes.
 
-    Rooms stand in columns, from those that import nothing to the entrance. An arrow leads from the
-    importing room to the imported one.
+    A row is a room that imports, a column one that is imported, a number the imports between their
+    files. Both have one order, so that imports against the flow lie above the diagonal.
     """
     known = modules()
     lines = {name: len(path.read_text().splitlines()) for name, path in known.items()}
@@ -98,62 +99,44 @@ def draw(out: Path = OUT) -> None:
         for other in imports(path, known):
             if room_of(name) != room_of(other):
                 edges[room_of(name), room_of(other)] += 1
-    rooms = {room_of(name) for name in known}
-    depth = depths(edges, rooms)
-    columns: dict[int, list[str]] = {}
-    for room in sorted(rooms):
-        columns.setdefault(depth[room], []).append(room)
-    figure, axes = plt.subplots()
-    lowest = 0.0
-    places: dict[str, tuple[float, float]] = {}
-    for column, (_, inside) in enumerate(sorted(columns.items())):
-        x, y = column * (WIDTH + GAP), 0.0
-        for room in inside:
-            names = sorted((n for n in known if room_of(n) == room), key=lambda n: -lines[n])
-            height = 0.32 + sum(max(lines[n] / LINES_AN_INCH, 0.045) for n in names)
-            axes.add_patch(Rectangle((x, y - height), WIDTH, height, fc="#f4f1ea", ec="#555555"))
-            total = sum(lines[n] for n in names)
-            axes.text(x + 0.05, y - 0.11, room, fontsize=9, weight="bold", va="center")
-            counts = f"{len(names)} files, {total:,} lines"
-            axes.text(x + 0.05, y - 0.23, counts, fontsize=6.5, va="center")
-            top = y - 0.3
-            for name in names:
-                size = max(lines[name] / LINES_AN_INCH, 0.045)
-                box = Rectangle((x + 0.06, top - size), WIDTH - 0.12, size)
-                box.set(fc="#c9d8e8", ec="white", lw=0.5)
-                axes.add_patch(box)
-                if size > 0.11:
-                    short = name.rsplit(".", 1)[-1]
-                    axes.text(x + 0.1, top - size / 2, short, fontsize=7, va="center")
-                top -= size
-            places[room] = (x, y - height / 2)
-            lowest = min(lowest, y - height)
-            y -= height + 0.35
-    for (user, used), count in sorted(edges.items()):
-        (x, y), (to_x, to_y) = places[user], places[used]
-        against = depth[user] <= depth[used]
-        start, end = (x, y), (to_x + WIDTH, to_y)
-        arrow = FancyArrowPatch(
-            start,
-            end,
-            arrowstyle="-|>",
-            mutation_scale=7,
-            connectionstyle="arc3,rad=0.08",
-            lw=0.4 + 0.12 * count**0.5,
-            color="#c0392b" if against else "#888888",
-            alpha=0.9 if against else 0.45,
-        )
-        axes.add_patch(arrow)
-    right = len(columns) * (WIDTH + GAP)
-    axes.set(xlim=(-GAP / 2, right - GAP / 2), ylim=(lowest - 0.1, 0.5))  # inches, as all above
-    figure.set_size_inches(right, 0.6 - lowest)
+    inside: dict[str, list[str]] = {}
+    for name in known:
+        inside.setdefault(room_of(name), []).append(name)
+    depth = depths(edges, set(inside))
+    rooms = sorted(inside, key=lambda room: (depth[room], room))
+    side = CELL * len(rooms)
+    figure, axes = plt.subplots(figsize=(NAMES + side + MARGIN, HEAD + side))
     figure.subplots_adjust(0.0, 0.0, 1.0, 1.0)
+    axes.set(xlim=(-NAMES, side + MARGIN), ylim=(side, -HEAD))  # inches, as all below
     axes.set_axis_off()
-    said = f"{len(known)} modules, {sum(lines.values()):,} lines; red: imports against the flow"
-    axes.set_title(said, fontsize=14)
+    for row, room in enumerate(rooms):
+        middle = CELL * (row + 0.5)
+        axes.text(-NAMES + 0.1, middle, room, fontsize=12, weight="bold", va="center")
+        total = sum(lines[name] for name in inside[room])
+        counts = f"{len(inside[room])} files, {total:,} lines"
+        axes.text(-0.12, middle, counts, fontsize=10, ha="right", va="center")
+        axes.text(middle, -0.1, room, fontsize=12, rotation=55, va="bottom")
+        for column, other in enumerate(rooms):
+            _draw_cell(axes, row, column, edges[room, other], depth[room] <= depth[other])
+    down = sum(count for (user, used), count in edges.items() if depth[used] < depth[user])
+    said = f"{down / sum(edges.values()):.0%} of imports between rooms go one way"
+    axes.text(-NAMES + 0.1, 0.3 - HEAD, said, fontsize=16, weight="bold", va="center")
+    below = f"{len(known)} modules, {sum(lines.values()):,} lines; a row imports from the columns"
+    axes.text(-NAMES + 0.1, 0.65 - HEAD, below, fontsize=11, va="center")
     with plt.rc_context(STYLE):
-        figure.savefig(out, bbox_inches="tight", metadata={"Date": None})
+        figure.savefig(out, metadata={"Date": None})
     plt.close(figure)
+
+
+def _draw_cell(axes: Any, row: int, column: int, count: int, against: bool) -> None:
+    """One number in its square: red where rooms import against the flow."""
+    ground = "#c9ccd1" if row == column else "#f3f4f6"
+    if count:
+        ground = "#f3c1ba" if against else "#c4d9ef"
+    corner = (CELL * column + 0.02, CELL * row + 0.02)
+    axes.add_patch(Rectangle(corner, CELL - 0.04, CELL - 0.04, fc=ground, ec="none"))
+    middle = (CELL * (column + 0.5), CELL * (row + 0.5))
+    axes.text(*middle, str(count or ""), fontsize=11, ha="center", va="center")
 
 
 def main(args: list[str] | None = None) -> None:

@@ -70,6 +70,15 @@ def test_the_citation_and_the_changelog_name_this_version() -> None:
     assert f"## [{leco_plugin.__version__}]" in (ROOT / "CHANGELOG.md").read_text()
 
 
+def test_the_citation_prefers_the_paper_and_keeps_the_software() -> None:
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert cited["type"] == "software" and cited["authors"] and cited["license"]
+    paper = cited["preferred-citation"]
+    assert paper["title"].startswith("LeCO-NeRF: ") and paper["url"] in (
+        (ROOT / "docs" / "upstream" / "leco_nerf.md").read_text()
+    )
+
+
 def test_every_python_that_is_declared_is_tried_before_a_release() -> None:
     declared = re.findall(r"Python :: (3\.\d+)", (ROOT / "pyproject.toml").read_text())
     jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "release.yml").read_text())["jobs"]
