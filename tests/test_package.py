@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import runpy
 import subprocess
 import sys
 from importlib.metadata import entry_points, version
@@ -77,6 +78,33 @@ def test_the_citation_prefers_the_paper_and_keeps_the_software() -> None:
     assert paper["title"].startswith("LeCO-NeRF: ") and paper["url"] in (
         (ROOT / "docs" / "upstream" / "leco_nerf.md").read_text()
     )
+
+
+def test_links_of_the_readme_are_absolute_on_a_package_index() -> None:
+    absolute = runpy.run_path(str(ROOT / ".ci" / "absolute_links.py"))["absolute"]
+    home = "https://github.com/someone/something"
+    changed = absolute(
+        "![a](docs/a.gif) [b](docs/b.md#c) [d](https://e.org/f) [g](#h)\n"
+        '<source srcset="docs/i.png"><img src="docs/j.png"> [![k](docs/k.png)](docs/l.md)',
+        home,
+        "v1.2.3",
+    )
+    assert changed == (
+        f"![a]({home}/raw/v1.2.3/docs/a.gif) [b]({home}/blob/v1.2.3/docs/b.md#c) "
+        "[d](https://e.org/f) [g](#h)\n"
+        f'<source srcset="{home}/raw/v1.2.3/docs/i.png"><img src="{home}/raw/v1.2.3/docs/j.png"> '
+        f"[![k]({home}/raw/v1.2.3/docs/k.png)]({home}/blob/v1.2.3/docs/l.md)"
+    )
+    text = absolute((ROOT / "README.md").read_text(), home, "main")
+    targets = re.findall(r"\]\(([^)\s]+)\)|(?:src|srcset|href)=\"([^\"]+)\"", text)
+    assert targets and all(re.match(r"https?://|#", one or other) for one, other in targets)
+
+
+def test_a_release_makes_links_absolute_before_it_builds() -> None:
+    jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "release.yml").read_text())["jobs"]
+    steps = [step.get("run", "") for step in jobs["build"]["steps"]]
+    (links,) = (number for number, run in enumerate(steps) if "absolute_links.py" in run)
+    assert links < steps.index("python -m build")
 
 
 def test_every_python_that_is_declared_is_tried_before_a_release() -> None:
