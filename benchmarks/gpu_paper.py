@@ -1,7 +1,7 @@
 """What the GPU suite's bars are on paper: `python benchmarks/gpu_paper.py`.
 
 Bytes and operations against the data sheets of two cards; nothing here is measured on a card.
-docs/gpu.md holds the tables that this prints, and a test compares them.
+docs/gpu-kernels.md holds the tables that this prints, and a test compares them.
 """
 
 from __future__ import annotations
