@@ -181,6 +181,7 @@ def test_kernels_that_can_be_turned_off_are_named() -> None:
         ("samplers/kernels/fused.py", "compute capability {} is below 8.0"),
         ("samplers/kernels/fused.py", "it decides otherwise about {} of {} positions"),
         ("samplers/kernels/gate_weights.py", "the kernel holds "),
+        ("samplers/kernels/gate_weights.py", "features; the kernel knows frequencies only"),
         ("samplers/estimator.py", "no cell cache, sampling will be slower: "),
         ("models/compute/grouped.py", "no grouped products, "),
         ("models/compute/grouped.py", "ms a layer grouped, "),

@@ -1,4 +1,4 @@
-"""What the tests of kernels share: where they run, and occupancies with every kind of gate.
+"""What the tests of kernels share: where they run, and occupancies with gates of every size.
 
 In Triton's interpreter on a CPU when TRITON_INTERPRET=1 stands in the environment, which
 `test_kernels_interpreted.py` sees to; else compiled, on a GPU.
@@ -42,7 +42,6 @@ def occupancy(
     layers: int = 2,
     octaves: int = 4,
     experts: int = 4,
-    encoding: EncodingConfig | None = None,
     seed: int = 0,
     walls: list[float] | None = None,
     unseen: bool = False,
@@ -53,13 +52,10 @@ def occupancy(
         unseen: whether no ray has crossed half of its cells.
     """
     torch.manual_seed(seed)
-    encoding = encoding or EncodingConfig(octaves=octaves)
-    gate = Gate(GateConfig(encoding, width, layers, experts))
+    gate = Gate(GateConfig(EncodingConfig(octaves=octaves), width, layers, experts))
     with torch.no_grad():
         for parameter in gate.parameters():
             parameter.mul_(2.0)
-        for table in gate.encoding.parameters():
-            table.normal_()
         gate.norm.weight.add_(torch.randn(width) * 0.3)
         gate.norm.bias.add_(torch.randn(width) * 0.3)
     space = Space(kind, (0.1, 0.2, -0.3), 1.5)

@@ -267,10 +267,29 @@ def test_sampling_waits_once_for_the_device() -> None:
     assert len(said) == 1
 
 
-@pytest.mark.parametrize("kind", ENCODINGS)
-def test_gates_on_all_features_have_a_kernel(kind: str) -> None:
-    occupancy = Occupancy(Gate(GateConfig(ENCODINGS[kind])), Space(), 0.5)
+def test_gates_on_frequencies_have_a_kernel() -> None:
+    occupancy = Occupancy(Gate(GateConfig(ENCODINGS["frequency"])), Space(), 0.5)
     assert why_not(occupancy) is None and fused.weights_of(occupancy) is not None
+
+
+@pytest.mark.usefixtures("on_any_device")
+@pytest.mark.parametrize("kind", sorted(ENCODINGS.keys() - {"frequency"}))
+def test_gates_on_tables_are_left_to_torch_with_a_reason(
+    kind: str, steep, monkeypatch, caplog
+) -> None:
+    for name in ("gate_kernel", "march_kernel"):
+        monkeypatch.setitem(sys.modules, f"leco_plugin.samplers.kernels.{name}", None)
+    asked = Occupancy(Gate(GateConfig(ENCODINGS[kind])), Space(), 0.5)
+    places = torch.rand(50, 3)
+    rays = Rays(places, torch.randn(50, 3), torch.zeros(50), torch.ones(50))
+    with caplog.at_level(logging.INFO, fused.__name__):
+        assert fused.decide(asked, places) is None
+        assert fused.march(asked, steep.cache, rays, March(0.1)) is None
+        assert torch.equal(asked.occupied(places), asked.query(places) >= asked.threshold_value)
+    reason = f"its gate has {kind} features; the kernel knows frequencies only"
+    assert why_not(asked) == reason
+    assert [entry.getMessage() for entry in caplog.records] == [f"no fused gate: {reason}"]
+    assert not fused._off
 
 
 @pytest.mark.parametrize(
@@ -279,7 +298,6 @@ def test_gates_on_all_features_have_a_kernel(kind: str) -> None:
         ({"width": 512}, "width 512; the kernel holds 256"),
         ({"layers": 9}, "layers 9; the kernel holds 8"),
         ({"encoding": EncodingConfig(octaves=21)}, "frequency features 66; the kernel holds 64"),
-        ({"encoding": EncodingConfig("vm", components=22)}, "vm features 66; the kernel holds 64"),
         ({"scene_experts": 64}, "logits 65; the kernel holds 64"),
     ],
 )

@@ -15,7 +15,6 @@ from samplers.kernel_cases import (
     positions,
 )
 
-from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.kernels.fused import twins_only
 from leco_plugin.samplers.kernels.gate_weights import gate_weights
@@ -81,32 +80,6 @@ def test_unseen_space_is_skipped(kind: str) -> None:
 def test_every_number_of_octaves(octaves: int, precision: str) -> None:
     asked = occupancy("contraction", precision, octaves=octaves)
     assert_agreement(asked, positions(PLACES))
-
-
-TABLES = {
-    "hash": EncodingConfig("hash", levels=5, features=2, log2_table=8, coarsest=3, finest=40),
-    "wide hash": EncodingConfig("hash", levels=6, features=4, log2_table=6, coarsest=2, finest=9),
-    "one level": EncodingConfig("hash", levels=1, features=1, log2_table=4, coarsest=2, finest=2),
-    "vm": EncodingConfig("vm", components=4, plane_cells=7),
-    "wide vm": EncodingConfig("vm", components=8, plane_cells=2),
-    "k-planes": EncodingConfig("k-planes", levels=3, features=2, coarsest=2, plane_cells=9),
-    "one plane": EncodingConfig("k-planes", levels=1, features=3, coarsest=1, plane_cells=1),
-}
-
-
-@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
-@pytest.mark.parametrize("name", TABLES)
-def test_every_table(name: str, precision: str) -> None:
-    kind = "contraction" if precision == "float32" else "box"
-    assert_agreement(occupancy(kind, precision, encoding=TABLES[name]), positions(PLACES))
-
-
-@pytest.mark.parametrize("name", TABLES)
-def test_tables_end_at_the_walls_of_the_cube(name: str) -> None:
-    asked = occupancy("box", "float32", encoding=TABLES[name])
-    ends = [-1.4, -1.3999999, 0.1, 1.5999999, 1.6, 1.7, torch.inf, torch.nan, 1e30]
-    places = torch.cartesian_prod(*[torch.tensor(ends, device=DEVICE)] * 3)
-    assert torch.equal(fused(asked, places), twin(asked, places))
 
 
 @pytest.mark.parametrize("experts", [1, 8, 15, 20])

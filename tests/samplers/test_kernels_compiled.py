@@ -29,9 +29,6 @@ GATES = {
     "width 16": (GateConfig(width=16, layers=1), "box", "bfloat16"),
     "width 128": (GateConfig(EncodingConfig(octaves=20), width=128), "contraction", "bfloat16"),
     "paper": (PAPER.gate, "contraction", "bfloat16"),
-    "hash": (GateConfig(EncodingConfig("hash")), "contraction", "bfloat16"),
-    "vm": (GateConfig(EncodingConfig("vm")), "box", "bfloat16"),
-    "k-planes": (GateConfig(EncodingConfig("k-planes")), "box", "bfloat16"),
     "float32": (GateConfig(width=32, layers=2), "box", "float32"),
 }
 
@@ -72,9 +69,6 @@ ON_ONE = {
     "width 16": 80,
     "width 128": 80,
     "paper": 90,
-    "hash": 90,
-    "vm": 80,
-    "k-planes": 90,
     "float32": 80,
 }
 
@@ -107,7 +101,6 @@ def test_the_gate_compiles_for_any_strides(folder: Path, monkeypatch) -> None:
 MARCHES = {
     "small": ("small", 0.0, torch.int16),
     "large": ("large", 1.0 / 256.0, torch.int32),
-    "hash": ("hash", 0.0, torch.int16),
     "width 128": ("width 128", 1.0 / 256.0, torch.int16),
 }
 """Gate, cone angle, and the type of the coarse cells."""
@@ -128,7 +121,7 @@ def cells(space: Space, dtype: torch.dtype, resolution: int = 32) -> CellCache:
 
 
 @pytest.mark.parametrize(
-    ("name", "capability"), on_each_card(MARCHES, {"small": 80, "hash": 80, "width 128": 90})
+    ("name", "capability"), on_each_card(MARCHES, {"small": 80, "width 128": 90})
 )
 def test_the_march_compiles(name: str, capability: int, folder: Path, monkeypatch) -> None:
     weights = weights_of(MARCHES[name][0], capability, monkeypatch)

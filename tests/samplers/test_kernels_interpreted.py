@@ -42,5 +42,5 @@ def test_kernels_agree_with_their_twins() -> None:
 @pytest.mark.skipif(torch.cuda.is_available(), reason="they run, compiled")
 def test_they_are_those_that_a_gpu_is_asked_for() -> None:
     said = run("-m", "gpu", "-rs", *(str(HERE / name) for name in NAMES)).splitlines()
-    assert int(said[-1].split(" skipped")[0]) > 80 and "passed" not in said[-1]
+    assert int(said[-1].split(" skipped")[0]) > 60 and "passed" not in said[-1]
     assert any("there is no CUDA device" in line for line in said)

@@ -10,7 +10,6 @@ from samplers.analytic_occupancy import camera_rays
 from samplers.kernel_cases import DEVICE, NEAR_THRESHOLD, ON_KERNELS, occupancy
 from waits import Waits
 
-from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.samplers.cells.build import build_cache
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.kernels.fused import twins_only
@@ -24,13 +23,10 @@ STEP = 1.0 / 16.0
 
 
 @functools.cache
-def estimator(
-    kind: str, precision: str = "float32", encoding: EncodingConfig | None = None
-) -> LearnedOccupancyEstimator:
-    asked = occupancy(kind, precision, octaves=2, width=16, encoding=encoding)
+def estimator(kind: str, precision: str = "float32") -> LearnedOccupancyEstimator:
+    asked = occupancy(kind, precision, octaves=2, width=16)
     made = LearnedOccupancyEstimator(asked, cache_bytes=0)
-    tolerance = 1e-2 if encoding is None else 1.0  # tables of random values have no flat cells
-    made.cache = build_cache(asked, budget=1 << 18, tolerance=tolerance, check_points=1 << 14)
+    made.cache = build_cache(asked, budget=1 << 18, tolerance=1e-2, check_points=1 << 14)
     return made
 
 
@@ -88,19 +84,6 @@ def assert_same(made: LearnedOccupancyEstimator, rays: Rays, rule: March) -> int
 def test_intervals_are_those_of_the_twin(kind: str, precision: str, cone_angle: float) -> None:
     rays = rays_of(6, torch.linspace(0.4, 5.0, 6), near=0.5)
     assert assert_same(estimator(kind, precision), rays, March(STEP, cone_angle)) > 20
-
-
-@pytest.mark.parametrize(
-    "encoding",
-    [
-        EncodingConfig("hash", levels=1, log2_table=8, coarsest=2, finest=2),
-        EncodingConfig("vm", components=4, plane_cells=1),
-        EncodingConfig("k-planes", levels=2, coarsest=2, plane_cells=4),
-    ],
-)
-def test_rays_through_tables(encoding: EncodingConfig) -> None:
-    made = estimator("box", encoding=encoding)
-    assert assert_same(made, rays_of(3, 3.0), March(STEP)) > 10
 
 
 def test_a_box_and_a_jitter_are_honoured() -> None:

@@ -13,15 +13,17 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from leco_plugin.samplers.kernels.encoding_kernel import frequencies, look_up
-from leco_plugin.samplers.kernels.gate_weights import FREQUENCY, GateWeights
+from leco_plugin.samplers.kernels.gate_weights import GateWeights
 from leco_plugin.seen import CELLS
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 """Whether kernels run in Triton's interpreter; decided when Triton was imported."""
 
-_INTERPRETED, _FREQUENCY = tl.constexpr(INTERPRETED), tl.constexpr(FREQUENCY)
+_INTERPRETED = tl.constexpr(INTERPRETED)
 _CELLS = tl.constexpr(CELLS)
+_ROUNDING = tl.constexpr(1.5 * 2**23)
+"""Added to a number below 2^22 it leaves the nearest whole one, whose last bit says whether it is
+odd; rounding instructions run at an eighth of the rate of additions."""
 
 
 @triton.jit
@@ -59,6 +61,51 @@ def _seen_at(u, v, w, seen):
     j = tl.minimum((v + 1.0) * (0.5 * _CELLS), last).to(tl.int32)
     k = tl.minimum((w + 1.0) * (0.5 * _CELLS), last).to(tl.int32)
     return tl.load(seen + (i * _CELLS + j) * _CELLS + k) != 0
+
+
+@triton.jit
+def _frequencies(u, v, w, OCTAVES: tl.constexpr, COLUMNS: tl.constexpr):
+    """`FrequencyEncoding`: sines, behind them the coordinates; and cosines.
+
+    A tile holds a feature of a position at each place, [ROWS, COLUMNS]; columns beyond the features
+    are padding, which the rows of the first matrix beyond them, all zero, leave without effect.
+    """
+    column = tl.arange(0, COLUMNS)
+    turning = column < 3 * OCTAVES
+    axis = (column % 3)[None, :]
+    scale = (1 << tl.where(turning, column // 3, 0)).to(tl.float32)[None, :]
+    coordinates = tl.where(
+        axis == 0, u[:, None], tl.where(axis == 1, v[:, None], w[:, None])
+    )  # [ROWS, COLUMNS]
+    sines, cosines = _sines_and_cosines(coordinates * scale)
+    return tl.where(turning[None, :], sines, coordinates), cosines
+
+
+@triton.jit
+def _sines_and_cosines(half_turns):
+    """sin(pi y) and cos(pi y), to 1e-7.
+
+    They come from y = 2^k x, reduced to a quarter turn without rounding, and a polynomial; the twin
+    rounds its angles, by up to 2^(k - 23), and that is how far they differ.
+    """
+    shifted = half_turns + _ROUNDING
+    part = half_turns - (shifted - _ROUNDING)
+    odd = shifted.to(tl.int32, bitcast=True) << 31
+    square = part * part
+    sine = tl.fma(square, 0.07765766030370826, -0.5982912856197324)
+    sine = tl.fma(square, sine, 2.5500775232145423)
+    sine = tl.fma(square, sine, -5.167710083507896)
+    sine = tl.fma(square, sine, 3.1415926401307073)
+    cosine = tl.fma(square, 0.2196896110974905, -1.331876568080807)
+    cosine = tl.fma(square, cosine, 4.058411352862603)
+    cosine = tl.fma(square, cosine, -4.934792830619646)
+    cosine = tl.fma(square, cosine, 0.9999999532476083)
+    return _flip_sign(part * sine, odd), _flip_sign(cosine, odd)
+
+
+@triton.jit
+def _flip_sign(values, sign_bits):
+    return (values.to(tl.int32, bitcast=True) ^ sign_bits).to(tl.float32, bitcast=True)
 
 
 @triton.jit
@@ -156,15 +203,9 @@ def gate_keeps(
     facts,
     matrices,
     vectors,
-    tables,
-    grids,
     seen,
     ROWS: tl.constexpr,
-    KIND: tl.constexpr,
     OCTAVES: tl.constexpr,
-    LEVELS: tl.constexpr,
-    FEATURES: tl.constexpr,
-    MASK: tl.constexpr,
     COLUMNS: tl.constexpr,
     WIDTH: tl.constexpr,
     PADDED_WIDTH: tl.constexpr,
@@ -181,12 +222,9 @@ def gate_keeps(
     inside &= _seen_at(u, v, w, seen)
 
     sums = tl.zeros((ROWS, PADDED_WIDTH), tl.float32)
-    if KIND == _FREQUENCY:
-        features, cosines = frequencies(u, v, w, OCTAVES, COLUMNS)
-        sums = _layer(cosines, matrices, sums, ROWS, COLUMNS, PADDED_WIDTH, HALF)
-        matrices += COLUMNS * PADDED_WIDTH
-    else:
-        features = look_up(u, v, w, tables, grids, COLUMNS, KIND, LEVELS, FEATURES, MASK)
+    features, cosines = _frequencies(u, v, w, OCTAVES, COLUMNS)
+    sums = _layer(cosines, matrices, sums, ROWS, COLUMNS, PADDED_WIDTH, HALF)
+    matrices += COLUMNS * PADDED_WIDTH
     sums = _layer(features, matrices, sums, ROWS, COLUMNS, PADDED_WIDTH, HALF)
     matrices += COLUMNS * PADDED_WIDTH
     hidden = _activate(sums, vectors, PADDED_WIDTH, HALF)
@@ -233,15 +271,9 @@ def _gate_kernel(
     facts,
     matrices,
     vectors,
-    tables,
-    grids,
     seen,
     ROWS: tl.constexpr,
-    KIND: tl.constexpr,
     OCTAVES: tl.constexpr,
-    LEVELS: tl.constexpr,
-    FEATURES: tl.constexpr,
-    MASK: tl.constexpr,
     COLUMNS: tl.constexpr,
     WIDTH: tl.constexpr,
     PADDED_WIDTH: tl.constexpr,
@@ -265,15 +297,9 @@ def _gate_kernel(
         facts,
         matrices,
         vectors,
-        tables,
-        grids,
         seen,
         ROWS,
-        KIND,
         OCTAVES,
-        LEVELS,
-        FEATURES,
-        MASK,
         COLUMNS,
         WIDTH,
         PADDED_WIDTH,

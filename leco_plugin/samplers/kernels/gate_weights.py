@@ -11,11 +11,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-KINDS = FREQUENCY, HASH, VM, K_PLANES = range(4)
-"""What the gate's features are, as the kernel numbers them."""
-NAMES = {"frequency": FREQUENCY, "hash": HASH, "vm": VM, "k-planes": K_PLANES}
 MOST_COLUMNS = 64
-"""Widest padded encoding; of frequencies sines and cosines each, so that 20 octaves fit."""
+"""Widest padded encoding, of sines and of cosines each, so that 20 octaves fit."""
 MOST_WIDTH = 256
 MOST_WIDTH_BUT_HOPPER = 128
 """Compiled for compute capability 8, a wider gate spills its registers by tens of kilobytes; 9 was
@@ -24,7 +21,7 @@ MOST_WIDTH_FLOAT32 = 64
 """Float32 products are no matrix instructions: compiled, a wider gate takes minutes and spills."""
 MOST_LAYERS = 8
 MOST_LOGITS = 64
-READ = 6
+READ = 4
 """Fields of `GateWeights` that a kernel reads; it is compiled for the others."""
 
 
@@ -37,27 +34,16 @@ class GateWeights(NamedTuple):
     facts: Tensor
     """float32 [12]: centre, half extent, walls (min, max), threshold, epsilon of the layer norm."""
     matrices: Tensor
-    """bfloat16 or float32, flat: the first layer (of frequencies for cosines, then for sines and
-    coordinates), the other hidden layers, the last layer, and in bfloat16 what its rounding left
-    over."""
+    """bfloat16 or float32, flat: the first layer (for cosines, then for sines and coordinates), the
+    other hidden layers, the last layer, and in bfloat16 what its rounding left over."""
     vectors: Tensor
     """float32, flat: the bias of each hidden layer, then the column sums and the bias of the last
     layer with the norm folded in."""
-    tables: Tensor
-    """float32, flat: the learned values of the encoding; anything for frequencies."""
-    grids: Tensor
-    """int32, flat: cells along the cube (points, of planes) and place in the tables, by level."""
     seen: Tensor
     """uint8, flat: whether training rays cross each cell of `SeenSpace`."""
-    kind: int
     octaves: int
-    levels: int
-    features: int
-    """Of each level; components, of vector-matrix products."""
-    mask: int
-    """Entries of a hash table, less one."""
     columns: int
-    """Columns of the padded encoding; of frequencies once for sines and once for cosines."""
+    """Columns of the padded encoding, once for sines and once for cosines."""
     width: int
     padded_width: int
     layers: int
@@ -90,8 +76,10 @@ def why_not(occupancy: Any, most_width: int = MOST_WIDTH) -> str | None:
         return "it has no gate of this package"
     if occupancy.precision not in ("bfloat16", "float32"):
         return f"its gate is asked in {occupancy.precision}"
+    if config.encoding.kind != "frequency":
+        return f"its gate has {config.encoding.kind} features; the kernel knows frequencies only"
     for name, size, most in (
-        (f"{config.encoding.kind} features", _columns(occupancy.gate), MOST_COLUMNS),
+        ("frequency features", _columns(config.encoding.octaves), MOST_COLUMNS),
         ("width", config.width, most_width),
         ("layers", config.layers, MOST_LAYERS),
         ("logits", 1 + config.scene_experts, MOST_LOGITS),
@@ -111,12 +99,13 @@ def gate_weights(occupancy: Any) -> GateWeights:
 def _pack(occupancy: Any) -> GateWeights:
     gate, space = occupancy.gate, occupancy.space
     config, half = gate.config, occupancy.precision == "bfloat16"
-    width, logits, columns = config.width, 1 + config.scene_experts, power_of_two(_columns(gate))
+    octaves = config.encoding.octaves
+    width, logits, columns = config.width, 1 + config.scene_experts, power_of_two(_columns(octaves))
     padded, padded_logits = power_of_two(width), power_of_two(logits)
     first, *others = (layer.weight.float().T for layer in gate.hidden)
     last = (gate.head.weight.float() * gate.norm.weight.float()).T
     matrices = [
-        *(_pad(matrix, columns, padded) for matrix in _of_features(first, config.encoding)),
+        *(_pad(matrix, columns, padded) for matrix in _of_features(first, octaves)),
         *(_pad(matrix, padded, padded) for matrix in others),
     ]
     last = _pad(last, padded, padded_logits)
@@ -137,8 +126,8 @@ def _pack(occupancy: Any) -> GateWeights:
         facts=torch.cat([fact.reshape(-1).float() for fact in facts]),
         matrices=_flat(matrices).to(torch.bfloat16 if half else torch.float32),
         vectors=_flat(vectors),
-        **_encoding_of(gate, facts[0].device),
         seen=occupancy.seen.cells.reshape(-1).view(torch.uint8),
+        octaves=octaves,
         columns=columns,
         width=width,
         padded_width=padded,
@@ -150,48 +139,15 @@ def _pack(occupancy: Any) -> GateWeights:
     )
 
 
-def _columns(gate: Any) -> int:
-    """Features of a gate's encoding; of frequencies sines and coordinates only."""
-    config = gate.config.encoding
-    return 3 * config.octaves + 3 if config.kind == "frequency" else int(gate.encoding.out_dim)
+def _columns(octaves: int) -> int:
+    """Sines and coordinates of a position; of cosines there are three fewer."""
+    return 3 * octaves + 3
 
 
-def _of_features(first: Tensor, config: Any) -> list[Tensor]:
+def _of_features(first: Tensor, octaves: int) -> list[Tensor]:
     """The first layer [features, width] in the parts in which the kernel has its features."""
-    if config.kind != "frequency":
-        return [first]
-    coordinates, sines, cosines = first.split([3, 3 * config.octaves, 3 * config.octaves])
+    coordinates, sines, cosines = first.split([3, 3 * octaves, 3 * octaves])
     return [cosines, torch.cat([sines, coordinates])]
-
-
-def _encoding_of(gate: Any, device: torch.device) -> dict[str, Any]:
-    """What the kernel is told of a gate's encoding."""
-    config, encoding = gate.config.encoding, gate.encoding
-    levels, features, mask = 1, 1, 0
-    sizes: list[int] = [0]
-    tables = [torch.zeros(1, dtype=torch.float32, device=device)]
-    if config.kind == "hash":
-        levels, features, mask = config.levels, config.features, encoding.mask
-        sizes, tables = [int(size) for size in encoding.resolutions.tolist()], [encoding.table]
-        places = encoding.offsets.tolist()
-    elif config.kind == "vm":
-        features, tables = config.components, [encoding.planes, encoding.lines]
-        sizes = [encoding.planes.shape[-1]]
-    elif config.kind == "k-planes":
-        levels, features, tables = config.levels, config.features, list(encoding.planes)
-        sizes = [plane.shape[-1] for plane in tables]
-    if config.kind != "hash":
-        places = [sum(table.numel() for table in tables[:level]) for level in range(levels)]
-    grids = [number for pair in zip(sizes, places) for number in pair]
-    return {
-        "tables": _flat(tables).float(),
-        "grids": torch.tensor(grids, dtype=torch.int32, device=device),
-        "kind": NAMES[config.kind],
-        "octaves": config.octaves if config.kind == "frequency" else 0,
-        "levels": levels,
-        "features": features,
-        "mask": mask,
-    }
 
 
 def power_of_two(size: int) -> int:
