@@ -111,11 +111,11 @@ def _draw_occupancies(figure: Any, top: float, shown: Shown, theme: Theme) -> No
     above[0].set_ylabel("space kept, %")
     draw_panel(above[0], replace(first, title="" if by_psnr else SIZE), theme)
     if first.points:
-        places = [(one.x, one.y) for one in first.points]
+        points = [(one.x, one.y) for one in first.points]
         names = [one.name.replace("taught grid", "taught") for one in first.points]
         colours = [look_of(one, theme)["color"] for one in first.points]
         seeds = [seed for one in first.points for seed in one.seeds]
-        name_points(above[0], places, names, colours, seeds)
+        name_points(above[0], points, names, colours, seeds)
     if by_psnr:
         above[0].set_xlabel("PSNR on unseen photographs, dB")
     for axes, by_time in zip(above[1:], others):
