@@ -42,9 +42,9 @@ PSNR after equally many steps. A gate that was frozen with the last of them has 
 """
 TIMED = """PSNR after equal time, and seconds to render a test image. What keeping a grid up takes
 is missing in training with it: a fine one shows here what it costs on two cores, and not how good
-it would be. Whoever gained more than 0.3 dB in the last third of the time is still rising; whoever
-ended more than 0.3 dB below its own best point fell. That others did neither does not mean that
-more time would not help them: rates fall to a tenth over whatever time is given.
+it would be. A method that gained more than 0.3 dB in the last third of the time is still rising.
+One that ended more than 0.3 dB below its own best point fell. The others may gain by more time as
+well: rates fall to a tenth over whatever time is given.
 """
 
 TIMES = """### How long the suites take
@@ -175,8 +175,8 @@ def _fronts(charts: Sequence[Mapping[str, Any]]) -> str:
                 its[name] += 1
     of = f"{len(charts)} scene{'s' if len(charts) > 1 else ''}"
     said = [
-        f"{sentence(who)}: nothing as small keeps less space on {its['size']} of {of}, nothing "
-        f"learned as soon on {its['learning time']}."
+        f"{sentence(who)}: on {its['size']} of {of} nothing as small keeps less space, on "
+        f"{its['learning time']} nothing that is learned as soon."
         for who, its in counts.items()
     ]
     return " ".join(said)

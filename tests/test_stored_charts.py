@@ -68,29 +68,29 @@ def test_it_is_said_for_every_scene_whether_ours_is_on_the_fronts(store: Store) 
     store("representations", "fox", *representations(other_seconds=8.0))
     text = answered()
     assert (
-        "MLP (ours): nothing as small keeps less space on 2 of 2 scenes, nothing learned as soon "
-        "on 1." in text
+        "MLP (ours): on 2 of 2 scenes nothing as small keeps less space, on 1 nothing that is "
+        "learned as soon." in text
     )
     link = "#suite-representations-on-city"
     kept = "| 12.5%, 50 kB | 30.0%, 33 kB | 10.0%, 4.0 MB |"
-    assert f"| [city]({link}) {kept} MLP (ours) is the soonest learned and unbeaten in size" in text
-    assert "MLP (ours) is unbeaten in size, behind hash grid in learning time" in text
+    assert f"| [city]({link}) {kept} MLP (ours): nothing as small or learned" in text
+    assert "nothing as small keeps less space; learned as soon, hash grid keeps less" in text
 
 
 def test_a_grid_that_is_smaller_and_keeps_less_is_named(store: Store) -> None:
     store("representations", "city", *representations(10.0, grid_kept=(0.05,)), **STEPS)
     text = answered()
     assert (
-        "nothing as small keeps less space on 0 of 1 scene," in text
-        and "behind grid 64³ in size (one seed: no verdict) |" in text
+        "on 0 of 1 scene nothing as small keeps less space," in text
+        and "as small, grid 64³ keeps less (one seed: no verdict) |" in text
     )
 
 
 def test_one_that_keeps_less_in_the_median_only_is_said_to_be_undecided(store: Store) -> None:
     store("representations", "city", *representations(10.0, grid_kept=(0.05, 0.05, 0.3)), **STEPS)
     text = answered()
-    assert "on 0 of 1 scene, nothing learned as soon on 1." in text
-    assert "behind grid 64³ (undecided in space) in size (3 seeds) |" in text
+    assert "on 0 of 1 scene nothing as small keeps less space, on 1 nothing that is" in text
+    assert "as small, grid 64³ (undecided in space) keeps less (3 seeds) |" in text
 
 
 def test_minutes_are_those_of_runs_two_at_a_time_and_shared_ones_count_once(store: Store) -> None:

@@ -18,8 +18,8 @@ BYTES_A_NUMBER = 2
 """In bfloat16, in which gates are asked on a CPU."""
 COSTS = {"size": "size", "learning time": "learn_seconds"}
 """The costs that fronts are of, and the figure of each in `Held`."""
-CHEAPEST = {"size": "smallest", "learning time": "soonest learned"}
-"""Words for the one that costs least."""
+AS_CHEAP = {"size": "as small", "learning time": "learned as soon"}
+"""Words for what costs no more."""
 
 
 _What = tuple[str, bool, str | None]
@@ -152,25 +152,16 @@ def fronts_of(one: Representation, all_of_them: Sequence[Representation]) -> lis
 
 
 def verdict(representations: Sequence[Representation]) -> str:
-    """Where each of ours stands, and what is ahead of the default gate on the other fronts.
+    """What of ours nothing that costs no more beats in space, and what does: by medians.
 
-    Fronts are of medians; what the seeds do not tell apart is said to be level.
+    What the seeds do not tell apart is said to be level, or undecided.
     """
     ours = [one for one in representations if one.ours]
     if not ours:
         return "our own gate was not frozen with every seed"
     learned, *small = ours
-    said = [_place_of(one, representations) or f"{one.name} is on neither front" for one in small]
-    fronts = fronts_of(learned, representations)
-    behind = [
-        f"behind {_best_ahead(learned, representations, figure)} in {name}"
-        for name, figure in COSTS.items()
-        if name not in fronts
-    ]
-    place = _place_of(learned, representations)
-    if behind:
-        place = f"{place or f'{learned.name} is'}{', ' if place else ' '}{', '.join(behind)}"
-    return f"{'; '.join([*said, place])} ({learned.against(learned, 'kept').by})"
+    said = [_standing_of(one, representations) for one in (*small, learned)]
+    return f"{'. '.join(said)} ({learned.against(learned, 'kept').by})"
 
 
 def shortest_verdict(representations: Sequence[Representation]) -> str:
@@ -193,8 +184,8 @@ def shortest_verdict(representations: Sequence[Representation]) -> str:
     return f"{ours[0].name} keeps more space than {leader}"
 
 
-def _place_of(one: Representation, all_of_them: Sequence[Representation]) -> str:
-    """What leads on the fronts that a representation is on; empty if it is on none."""
+def _standing_of(one: Representation, all_of_them: Sequence[Representation]) -> str:
+    """Of the costs on whose front it is, that nothing as cheap keeps less; of others, what does."""
     others = [other for other in all_of_them if other is not one]
     if all(one.kept <= other.kept for other in others):
         said = f"{one.name} keeps least space, {one.kept:.1f}% in {one.median('size'):.0f} kB"
@@ -204,12 +195,14 @@ def _place_of(one: Representation, all_of_them: Sequence[Representation]) -> str
                 said += f", {beside} {' and '.join(names)}"
         return said
     fronts = fronts_of(one, all_of_them)
-    by_cost = [name for name in fronts if _is_cheapest(one, others, COSTS[name])]
-    by_space = [name for name in fronts if name not in by_cost]
-    said_of = [f"the {CHEAPEST[name]}" for name in by_cost]
-    if by_space:
-        said_of.append(f"unbeaten in {' and in '.join(by_space)}")
-    return f"{one.name} is {' and '.join(said_of)}" if said_of else ""
+    free = " or ".join(AS_CHEAP[name] for name in fronts)
+    parts = [f"nothing {free} keeps less space"] if free else []
+    parts += [
+        f"{AS_CHEAP[name]}, {_best_ahead(one, all_of_them, figure)} keeps less"
+        for name, figure in COSTS.items()
+        if name not in fronts
+    ]
+    return f"{one.name}: {'; '.join(parts)}"
 
 
 def _is_cheapest(one: Representation, others: Sequence[Representation], figure: str) -> bool:
