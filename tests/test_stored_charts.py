@@ -14,6 +14,7 @@ import learning
 import pytest
 import readme_parts as parts
 from chart_results import occupancy, results, run
+from eight_questions import eight_answers
 from results_page import sampling_section
 
 from leco_plugin.capacity import choice
@@ -61,6 +62,41 @@ def representations(other_seconds: float, grid_kept: tuple[float, ...] = (0.3,))
 
 def test_without_suites_there_are_no_answers() -> None:
     assert answers.answers_section() == []
+
+
+def capacity_of(*rows: tuple[str, str, int, float]) -> dict[str, Any]:
+    """What is stored of `leco capacity`, of family, size, bytes and volume kept."""
+    names = ("family", "size", "bytes", "kept_volume")
+    return {
+        "representations": [dict(zip(names, row)) for row in rows],
+        "scene": {"train_images": 30},
+    }
+
+
+REPORTS = {
+    "city-2": capacity_of(("vm", "4", 2_000, 0.04), ("grid", "64", 1_000, 0.05)),
+    "city-4": capacity_of(("vm", "4", 3_000, 0.05), ("grid", "64", 900, 0.05)),
+    "fog": capacity_of(("vm", "4", 3_000, 0.9), ("grid", "64", 900, 0.95)),
+}
+
+
+def test_eight_questions_have_an_answer_each_or_are_not_measured(store: Store) -> None:
+    unknown = eight_answers(REPORTS)
+    assert [line.split(".")[0] for line in unknown] == [*"12345678"]
+    assert [line.endswith("Not measured.") for line in unknown] == [True] * 6 + [False] * 2
+    assert "on `fog` the gate keeps 90%" in unknown[6]
+    timed = {"protocol": {"seconds": 90.0, "steps": None, "at_once": 1}}
+    names = ("learn, freeze, go on", "learn, freeze, from scratch", "never frozen")
+    runs = [
+        run(name, seed, psnr=psnr + 0.1 * seed)
+        for name, psnr in zip(names, (22.0, 20.5, 23.0))
+        for seed in range(3)
+    ]
+    store("freeze", "fox", *runs, **timed)
+    answer = eight_answers(REPORTS)[3]
+    assert answer.startswith("4. **Why freeze, and go on with the same network?** Going on ends ")
+    assert "+1.5 dB above a start from scratch, and -1.0 dB above a gate that is" in answer
+    assert answer.endswith("ahead of the best other on none of 1 scene, behind it on 1.")
 
 
 def test_it_is_said_for_every_scene_whether_ours_is_on_the_fronts(store: Store) -> None:
