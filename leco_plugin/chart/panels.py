@@ -8,6 +8,7 @@ from typing import Any
 
 from leco_plugin.chart.findings.learned import learned_headline, learned_of
 from leco_plugin.chart.findings.representations import (
+    SPARSE,
     Representation,
     never_held_of,
     representations_of,
@@ -128,7 +129,7 @@ def kept_panel(figure: str, held: Sequence[Representation], lines: Sequence[Line
     """Space kept at equal loss against one of `HELD_COSTS`, of occupancies that have it."""
     names = [line.name for line in lines]
     points = []
-    for one in (one for one in held if one.has(figure)):
+    for one in (one for one in held if one.has(figure) and one.name != SPARSE):
         large = [other.name for other in held if other.name in names and one.is_small_of(other)]
         like = one.name if one.name in names else large[0] if large else None
         number = None if like is None else names.index(like)

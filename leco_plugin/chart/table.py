@@ -11,6 +11,7 @@ from leco_plugin.chart.findings.learned import Learned, falls, learned_of, settl
 from leco_plugin.chart.findings.representations import (
     Representation,
     fronts_of,
+    keeps_all,
     never_held_of,
     representations_of,
 )
@@ -256,6 +257,15 @@ def left_out(lines: Sequence[Line]) -> list[str]:
         for run in line.runs
         for size in ((run.get("occupancy") or {}).get("at_equal_loss") or {}).get("left_out", [])
     }
+    full = {
+        row["name"]
+        for line in lines
+        for run in line.runs
+        for row in ((run.get("occupancy") or {}).get("at_equal_loss") or {}).get("others", ())
+        if keeps_all(row)
+    }
+    if full:
+        said.append(f"Left out, for keeping all space in some run: {', '.join(sorted(full))}.")
     if sizes:
         listed = ", ".join(f"{size}³" for size in sorted(sizes))
         said.append(f"Left out, for want of memory or time in some run: grid {listed}.")

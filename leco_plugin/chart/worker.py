@@ -28,7 +28,7 @@ SMALL_GATES = {
 """A gate of each kind that keeps little for its bytes in `leco capacity`: 5 to 27 kB."""
 TAUGHT_GRIDS = (32, 64, 128, 256)
 """Cells along an axis of grids that are taught as small gates are."""
-SPARSE, BYTES_A_POINT = "sparse points", 6
+BYTES_A_POINT = 6
 """Its three numbers in half precision."""
 
 
@@ -147,6 +147,7 @@ def compare_at_freezing(model: Any, datamanager: Any, contender: Contender) -> d
     from leco_plugin.capacity.measuring import lesson_of, taught_grid, taught_score
     from leco_plugin.capacity.search import gates
     from leco_plugin.capacity.sources import Source
+    from leco_plugin.chart.findings.representations import SPARSE
     from leco_plugin.evaluation.clock import seconds_now
     from leco_plugin.learning.dense import evaluating
     from leco_plugin.scenes.survey import sparse_points

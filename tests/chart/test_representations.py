@@ -111,12 +111,16 @@ def test_grids_of_the_same_lesson_and_sparse_points_stand_beside() -> None:
     facts["at_equal_loss"]["others"] = [
         taught("taught grid 64³", 1_000, 0.1) | {"learned_first": True},
         taught("sparse points", 60_000, 0.5) | {"learned_first": False, "seconds": 1.0},
+        taught("taught grid 512³", 0, 1.0) | {"learned_first": True},
     ]
     ours = run("MLP (ours)", learn_seconds=3.0, occupancy=facts)
     held = {one.name: one for one in representations_of(lines_of(results(ours)))}
     assert held["taught grid 64³"].median("learn_seconds") == 23.0
     assert held["sparse points"].median("learn_seconds") == 1.0
     assert [held[f"grid {cells}³"].median("size") for cells in (64, 128)] == [2.0, 262.144]
+    assert "taught grid 512³" not in held
+    left = "Left out, for keeping all space in some run: taught grid 512³."
+    assert left in table(results(ours))
     assert not any(one.ours for name, one in held.items() if name != "MLP (ours)")
     assert verdict([*held.values()]) == (
         "MLP (ours): nothing learned as soon keeps less space; as small, taught grid 64³ keeps "

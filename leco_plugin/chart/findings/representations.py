@@ -14,6 +14,8 @@ OUR_KIND = "MLP"
 """Kind of the default gate."""
 SMALL_OURS = "small MLP (ours)"
 """The small gate of that kind, which the trained field taught."""
+SPARSE = "sparse points"
+"""What is near one of the scene's is kept; not drawn, for it keeps too much."""
 BYTES_A_NUMBER = 2
 """In bfloat16, in which gates are asked on a CPU."""
 COSTS = {"size": "size", "learning time": "learn_seconds"}
@@ -104,6 +106,11 @@ def representations_of(lines: Sequence[Line]) -> list[Representation]:
     return found if len(gates) > 1 or any(one.is_grid for one in found) else []
 
 
+def keeps_all(row: Mapping[str, Any]) -> bool:
+    """Whether what was measured of a representation is that it holds nothing."""
+    return bool(row["kept_reached_volume"] >= 1.0)
+
+
 def never_held_of(lines: Sequence[Line]) -> list[str]:
     """Contenders whose gate was not frozen and measured in every run, and is left out."""
     return [
@@ -127,7 +134,7 @@ def _held_in(run: Mapping[str, Any], line: Line) -> dict[_What, Held]:
         name = SMALL_OURS if is_ours else f"small {row['name']}"
         learned_in = seconds + row["seconds"]
         found[name, is_ours, row["name"]] = _made_of_field(row, row["seconds"], learned_in)
-    for row in occupancy["at_equal_loss"].get("others", ()):
+    for row in (one for one in occupancy["at_equal_loss"].get("others", ()) if not keeps_all(one)):
         learned_in = row["seconds"] + (seconds if row["learned_first"] else 0.0)
         found[row["name"], False, None] = _made_of_field(row, row["seconds"], learned_in)
     for row in sorted(occupancy["at_equal_loss"]["grids"], key=lambda row: row["resolution"]):
