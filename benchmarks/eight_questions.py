@@ -99,16 +99,18 @@ def _seconds(charts: Sequence[Mapping[str, Any]]) -> str:
     learned = [[one for one in some if one.kind is None and not one.is_grid] for some in held]
     ours = [one for some in learned for one in some if one.ours]
     rest = [one for some in learned for one in some if not one.ours and one.name in KINDS]
-    beyond = [one.median("beyond") for some in held for one in some if one.has("beyond")]
-    small = [
-        one.median("beyond") for some in held for one in some if one.kind and one.has("beyond")
-    ]
+    beyond: dict[str, list[float]] = {"small gate": [], "taught grid": [], "grid of densities": []}
+    for one in (one for some in held for one in some if one.has("beyond")):
+        taught = "taught grid" if one.name.startswith("taught") else None
+        kind = taught or ("small gate" if one.kind else "grid of densities" * one.is_grid)
+        if kind:
+            beyond[kind].append(one.median("beyond"))
+    more = [f"a {kind} {_span(some, '.0f')} s" for kind, some in beyond.items() if some]
     return (
         f"Our gate is learned in {_span((one.median('learn_seconds') for one in ours), '.0f')} s "
         f"of a core, gates on hash grids and planes in "
-        f"{_span((one.median('learn_seconds') for one in rest), '.0f')}. A small gate takes "
-        f"{_span(small, '.0f')} s more, from a field that has learned; the other ways to hold it "
-        f"{_span(beyond, '.0f')}. A GPU was not measured."
+        f"{_span((one.median('learn_seconds') for one in rest), '.0f')}. From a field that has "
+        f"learned, more is made: {', '.join(more)}. A GPU was not measured."
     )
 
 

@@ -50,7 +50,9 @@ def noted(folder: Path) -> dict[str, str]:
 
 def size(kilobytes: float) -> str:
     """A size in words."""
-    return f"{kilobytes / 1e3:.1f} MB" if kilobytes >= 1e3 else f"{kilobytes:.0f} kB"
+    if kilobytes >= 1e3:
+        return f"{kilobytes / 1e3:.1f} MB"
+    return f"{kilobytes:.{0 if kilobytes >= 10.0 else 1}f} kB"
 
 
 def picture(name: str) -> str:
