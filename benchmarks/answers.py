@@ -35,7 +35,8 @@ Grids, and a small gate of each kind, are made from the field that learned with 
 is filled with densities, as hosts fill theirs; a *taught grid* has the lesson that small gates
 have. *Sparse points* keep what is near one of the scene's. More sizes of all are
 [elsewhere](measurements.md#how-much-a-scene-needs-gates-and-grids-at-equal-loss). Sizes are those
-of numbers in bfloat16, and of grids as octrees.
+of numbers in bfloat16, and of grids as octrees; where no taught grid stands beside, grids are in
+bits, one a cell.
 """
 LEARNED = """Space that each gate keeps, of what rays reach, where it loses 0.1% of the surface, and
 PSNR after equally many steps. A gate that was frozen with the last of them has guided nothing.

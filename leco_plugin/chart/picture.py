@@ -48,7 +48,8 @@ TOP, LINE_HEIGHT, SMALL_LINE_HEIGHT = 0.985, 0.04, 0.0235
 COSTS_BELOW = "What it costs. Up and left is better; nothing is better in both than the grey line."
 PSNR_BELOW = "PSNR on unseen photographs, dB, against what it costs. Up and left is better:"
 KEPT_SPACE = f"Space that must be sampled where each loses {LOST_SURFACE_MASS:.1%} of the surface"
-SIZE = "size, kB: numbers in bfloat16, grids as octrees"
+SIZE = "size, kB: numbers in bfloat16, grids "
+AS_OCTREES, IN_BITS = "as octrees", "in bits"
 
 
 def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
@@ -64,7 +65,8 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
         figure.text(0.015, below, "\n".join(said), va="top", fontsize=11.5)
         below -= SMALL_LINE_HEIGHT * (len(said) - 1)
         if shown.space:
-            _draw_occupancies(figure, below, shown, theme)
+            stored = AS_OCTREES if "octree_bytes" in str(results["runs"]) else IN_BITS
+            _draw_occupancies(figure, below, shown, theme, SIZE + stored)
         else:
             _draw_race(figure, below - 0.08 - 0.43, shown, theme)
         return save_picture(figure, path, results, dpi=160)
@@ -94,7 +96,7 @@ def _draw_race(figure: Any, height: float, shown: Shown, theme: Theme) -> None:
     panels[0].set_ylabel("PSNR, dB")
 
 
-def _draw_occupancies(figure: Any, top: float, shown: Shown, theme: Theme) -> None:
+def _draw_occupancies(figure: Any, top: float, shown: Shown, theme: Theme, size: str) -> None:
     """Space kept at equal loss above; curves and costs, small, below."""
     lines, (first, *others) = shown.lines, shown.space
     figure.text(0.015, 0.335, PSNR_BELOW, va="top", fontsize=11.5)
@@ -109,7 +111,7 @@ def _draw_occupancies(figure: Any, top: float, shown: Shown, theme: Theme) -> No
     low = 0.455 if by_psnr else 0.43
     above = [figure.add_axes((x, low, wide, top - 0.11 - low)) for x, wide in places]
     above[0].set_ylabel("space kept, %")
-    draw_panel(above[0], replace(first, title="" if by_psnr else SIZE), theme)
+    draw_panel(above[0], replace(first, title="" if by_psnr else size), theme)
     if first.points:
         points = [(one.x, one.y) for one in first.points]
         names = [one.name.replace("taught grid", "taught") for one in first.points]
