@@ -16,7 +16,7 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
 from leco_plugin.chart.findings.summary import Line
 from leco_plugin.chart.picture import draw_curves, name_ends
-from leco_plugin.chart.theme import LIGHT, Theme, new_figure, save_picture, style, themed
+from leco_plugin.chart.theme import LIGHT, new_figure, save_picture, style, themed
 from leco_plugin.evaluation.clock import Budget
 from leco_plugin.evaluation.equal_loss import occupancy_facts, truth_of
 from leco_plugin.evaluation.inspection import ViewBox
@@ -118,7 +118,7 @@ def _scene_facts(city: CityConfig, capture: CaptureConfig, manager: Any) -> dict
     }
 
 
-def draw_chart(report: dict[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
+def draw_chart(report: dict[str, Any], path: Path) -> Path:
     """Draws the demo's chart from its report: PSNR against seconds of training of both runs."""
     runs, blocks, cores = report["runs"], report["scene"]["blocks"], report["machine"]["cores"]
     where = f"{cores} CPU cores" if report["machine"]["device"] == "cpu" else "one GPU"
@@ -126,18 +126,18 @@ def draw_chart(report: dict[str, Any], path: Path, theme: Theme = LIGHT) -> Path
     title = f"{gain:+.1f} dB after the same time, by skipping what is empty"
     names = ("skips what it has\nlearned is empty", "the same model,\nskipping nothing")
     lines = [Line(name, "", run["sampler"], (run,)) for name, run in zip(names, runs)]
-    with themed(theme):
-        figure = new_figure((8, 4.4), theme.page)
+    with themed(LIGHT):
+        figure = new_figure((8, 4.4), LIGHT.page)
         figure.suptitle(title, fontsize=14, fontweight="bold", x=0.01, ha="left")
         scene = f"Procedural city of {blocks} x {blocks} blocks, {where}, one seed: no verdict"
         figure.text(0.01, 0.93, scene, va="top", fontsize=11.5)
         axes = figure.add_axes((0.11, 0.14, 0.55, 0.68))
-        draw_curves(axes, lines, theme)
+        draw_curves(axes, lines, LIGHT)
         axes.set_xlabel("seconds of training")
         axes.set_ylabel("PSNR on unseen photographs, dB", fontsize=11)
-        name_ends(axes, lines, theme, apart=0.16)
+        name_ends(axes, lines, LIGHT, apart=0.16)
         if (frozen := runs[0]["freeze_seconds"]) is not None:
-            colour = style(0, theme)["color"]
+            colour = style(0, LIGHT)["color"]
             axes.axvline(frozen, color=colour, linestyle="--", linewidth=1.4)
             known = f" what is empty\n is known after {frozen:.0f} s"
             at = (frozen, 0.06)

@@ -24,6 +24,7 @@ from leco_plugin.evaluation.inspection import (
     ViewBox,
     cameras_of,
     exposed,
+    mapped_box,
     query,
     seen_at,
     whole_box,
@@ -180,16 +181,6 @@ def shown_part(surface: KeptSurface, back: Tensor | None, description: Path | No
             "the scene that the occupancy was learned on? (--data names another)"
         )
     return KeptSurface(surface.positions[shown], surface.values[shown])
-
-
-def mapped_box(occupancy: Occupancy) -> ViewBox:
-    """The part of the gate's cube in which it was taught."""
-    if occupancy.space.kind != "box":
-        return ViewBox(-torch.ones(3), torch.ones(3))
-    box = whole_box(occupancy)
-    device = occupancy.threshold_value.device
-    low, high = occupancy.space.map(torch.stack([box.low, box.high]).to(device)).cpu()
-    return ViewBox(low, high)
 
 
 def finest(box: ViewBox) -> int:

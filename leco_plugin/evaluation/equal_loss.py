@@ -18,6 +18,7 @@ from nerfstudio.cameras.rays import RayBundle
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from leco_plugin.evaluation import inspection
 from leco_plugin.evaluation.field_grids import (
     FieldGrids,
     density_of,
@@ -220,13 +221,9 @@ def _measured(
 
 
 def mapped_box(mixture: Mixture) -> ViewBox:
-    """The scene's box in mapped coordinates; an unbounded scene fills the cube."""
-    corners = torch.tensor([[-1.0] * 3, [1.0] * 3], device=mixture.device)
-    if mixture.region.space.kind == "box":
-        box = whole_box(mixture.occupancy())
-        ends = torch.stack([box.low, box.high]).to(mixture.device)
-        corners = mixture.region.space.map(ends).clamp(-1.0, 1.0)
-    return ViewBox(*corners)
+    """`inspection.mapped_box` of a mixture, within the cube and on the mixture's device."""
+    box = inspection.mapped_box(mixture.occupancy())
+    return ViewBox(*(end.clamp(-1.0, 1.0).to(mixture.device) for end in (box.low, box.high)))
 
 
 def reached_volume(mixture: Mixture, taught: Tensor, count: int, seed: int = 0) -> Tensor:

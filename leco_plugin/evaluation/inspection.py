@@ -124,6 +124,17 @@ def whole_box(occupancy: Occupancy) -> ViewBox:
     return ViewBox(low, high)
 
 
+def mapped_box(occupancy: Occupancy) -> ViewBox:
+    """The part of the gate's cube in which it was taught, on the CPU; all of it where the scene is
+    unbounded."""
+    if occupancy.space.kind != "box":
+        return ViewBox(-torch.ones(3), torch.ones(3))
+    box = whole_box(occupancy)
+    device = occupancy.threshold_value.device
+    low, high = occupancy.space.map(torch.stack([box.low, box.high]).to(device)).cpu()
+    return ViewBox(low, high)
+
+
 def cameras_of(occupancy: Occupancy) -> Tensor:
     """Camera centres [C, 3] that the report names, scene units; [0, 3] if it names none."""
     listed = occupancy.report.get("cameras")

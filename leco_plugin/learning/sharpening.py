@@ -80,7 +80,6 @@ def teach(
     steps: int,
     precision: Precision,
     seed: int = 0,
-    rate: float = 2.0 * RATES["gate"],
     on_progress: Callable[[float], None] | None = None,
 ) -> Gate:
     """A gate that was taught by a lesson, in the precision of its later queries, and rounded as it
@@ -90,11 +89,11 @@ def teach(
 
     Args:
         steps: of Adam, on `BATCH` positions each.
-        rate: of networks; tables learn at least as fast as those of a field.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         gate = Gate(config).to(lesson.mapped.device)
+    rate = 2.0 * RATES["gate"]  # of networks; tables learn at least as fast as those of a field
     tables = list(gate.encoding.parameters())
     known = {id(table) for table in tables}
     groups = [{"params": [p for p in gate.parameters() if id(p) not in known], "lr": rate}]

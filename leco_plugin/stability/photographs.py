@@ -326,7 +326,9 @@ def _take_pictures(stage: Stage, capture: Capture, folder: Path) -> None:
             truth = {"depth": seen.depth, "detail": seen.detail, "shown_by": shown}
             np.savez(folder / TRUTH / f"{shot.name}.npz", **truth)
         random = np.random.default_rng([capture.seed, 23, number])
-        clouds.append(_points(seen.image, view._replace(pose=shot.written), random))
+        clouds.append(
+            view.lens.some_points(shot.written, view.depth, seen.image, POINTS_PER_VIEW, random)
+        )
         frames.append(_frame(shot, view.lens))
     cloud = np.concatenate(clouds)
     if len(cloud):
@@ -342,16 +344,6 @@ def _take_pictures(stage: Stage, capture: Capture, folder: Path) -> None:
         "test_filenames": held_out,
     }
     (folder / TRANSFORMS).write_text(json.dumps(transforms, indent=1) + "\n")
-
-
-def _points(image: NDArray[np.uint8], view: View, random: Generator) -> NDArray[Any]:
-    """Some surface points of a picture: [N] rows of `xyz` and `rgb`."""
-    hits = np.argwhere(np.isfinite(view.depth))
-    chosen = tuple(hits[random.permutation(len(hits))[:POINTS_PER_VIEW]].T)
-    row = np.empty(len(chosen[0]), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    row["xyz"] = view.lens.points(view.pose, view.depth)[chosen]
-    row["rgb"] = image[chosen][:, :3]
-    return row
 
 
 def _frame(shot: Shot, lens: Lens) -> dict[str, Any]:

@@ -12,11 +12,11 @@ import torch
 import trimesh
 from ball_occupancy import CENTRE, HALF, RADIUS, ball
 
+from leco_plugin.evaluation.inspection import mapped_box
 from leco_plugin.export_surface import (
     KeptSurface,
     finest,
     kept_surface,
-    mapped_box,
     shown_part,
     write_ply,
 )

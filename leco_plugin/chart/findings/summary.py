@@ -45,11 +45,11 @@ class Verdict:
         ours, theirs = self.seeds
         return f"{ours} seeds" if ours == theirs else f"{ours} and {theirs} seeds"
 
-    def said(self, unit: str = "dB", form: str = ".2f") -> str:
+    def said(self, unit: str = "dB") -> str:
         """The whole verdict, such as "ahead: +1.50 ± 0.42 dB, 3 seeds"."""
         word = f"{self.word}: " if self.word else ""
-        margin = "" if self.margin is None else f" ± {self.margin:{form}}"
-        return f"{word}{self.difference:+{form}}{margin} {unit}, {self.by}"
+        margin = "" if self.margin is None else f" ± {self.margin:.2f}"
+        return f"{word}{self.difference:+.2f}{margin} {unit}, {self.by}"
 
 
 def compare(ours: Sequence[float], theirs: Sequence[float], close: float | None = CLOSE) -> Verdict:

@@ -6,6 +6,7 @@ Poses are camera-to-world [3, 4] in metres, OpenGL axes (x right, y up, looking 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.random import Generator
@@ -100,6 +101,23 @@ class Lens:
     def points(self, pose: Array, depth: NDArray[np.floating]) -> Array:
         """Points [height, width, 3] seen by a camera-to-world pose [3, 4] at ray depths."""
         return pose[:, 3] + np.asarray(depth)[..., None] * (self.directions() @ pose[:, :3].T)
+
+    def some_points(
+        self,
+        pose: Array,
+        depth: NDArray[np.floating],
+        image: NDArray[np.uint8],
+        most: int,
+        random: Generator,
+    ) -> NDArray[Any]:
+        """Up to so many points that a picture [height, width, 3 or 4] shows: rows of `xyz` and
+        `rgb`."""
+        seen = np.argwhere(np.isfinite(depth))
+        chosen = tuple(seen[random.permutation(len(seen))[:most]].T)
+        rows = np.empty(len(chosen[0]), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
+        rows["xyz"] = self.points(pose, depth)[chosen]
+        rows["rgb"] = image[chosen][:, :3]
+        return rows
 
     def axial(self, depth: NDArray[np.floating]) -> NDArray[np.float32]:
         """Depth files from ray depths (metres, inf for nothing): see `city.folder`."""

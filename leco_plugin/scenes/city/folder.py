@@ -129,13 +129,10 @@ class NerfstudioLayout(Layout):
         for view in self.views:
             picture, depths = self.files(view)
             depth = self.lens.along_ray(np.load(folder / depths, allow_pickle=False))
-            seen = np.argwhere(np.isfinite(depth))
-            chosen = tuple(seen[random.permutation(len(seen))[:_SPARSE_POINTS_PER_VIEW]].T)
-            row = np.empty(len(chosen[0]), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
-            row["xyz"] = self.lens.points(view.pose, depth)[chosen]
-            with Image.open(folder / picture) as image:
-                row["rgb"] = np.asarray(image)[chosen][:, :3]
-            rows.append(row)
+            with Image.open(folder / picture) as opened:
+                image = np.asarray(opened)
+            most = _SPARSE_POINTS_PER_VIEW
+            rows.append(self.lens.some_points(view.pose, depth, image, most, random))
         return np.concatenate(rows)
 
 
