@@ -10,7 +10,7 @@ import checkout  # noqa: F401
 from chart_sections import by_scene, notes
 from page_parts import size, table
 
-from leco_plugin.chart.findings.learned import (
+from leco_plugin.chart.learned import (
     Learned,
     falls,
     learned_of,
@@ -19,10 +19,10 @@ from leco_plugin.chart.findings.learned import (
     still_rising,
     words_of,
 )
-from leco_plugin.chart.findings.representations import COSTS, fronts_of, representations_of
-from leco_plugin.chart.findings.summary import RENDERING, Line, compare, lines_of, sentence
 from leco_plugin.chart.methods import SUITES
 from leco_plugin.chart.panels import asks_what_was_learned, finding_of
+from leco_plugin.chart.representations import COSTS, fronts_of, representations_of
+from leco_plugin.chart.summary import RENDERING, Line, compare, lines_of, sentence
 
 HEAD = """## The answers with their figures
 

@@ -13,9 +13,9 @@ import checkout  # noqa: F401
 from page_parts import noted
 from stability_page import has_lost, runs_gone_on
 
-from leco_plugin.chart.findings.learned import learned_of
-from leco_plugin.chart.findings.summary import Verdict, figure_in, lines_of, versus
+from leco_plugin.chart.learned import learned_of
 from leco_plugin.chart.methods import NEVER_FROZEN, VARIANTS
+from leco_plugin.chart.summary import Verdict, figure_in, lines_of, versus
 from leco_plugin.chart.table import rows
 
 EQUAL_EXPERTS = VARIANTS["leco-occupancy-homogeneous"]

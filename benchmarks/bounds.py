@@ -21,14 +21,14 @@ from typing import Any
 import checkout  # noqa: F401
 import tyro
 
-from leco_plugin.chart.findings.summary import compare
+from leco_plugin.chart.summary import compare
 from leco_plugin.evaluation.clock import Budget
 from leco_plugin.evaluation.report import describe_code, describe_machine, made_by
 from leco_plugin.evaluation.timed_run import timed_run
 from leco_plugin.learning.collapse import GateCollapsed
 from leco_plugin.method_configs import leco_occupancy
-from leco_plugin.models.failures import TrainingStopped
 from leco_plugin.scenes.bounds import BoundsConfig
+from leco_plugin.scenes.input_error import TrainingStopped
 from leco_plugin.scenes.whole_files import write_json
 
 Pair = tuple[float, float]

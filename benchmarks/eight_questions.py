@@ -12,13 +12,13 @@ from growth_picture import cities, finding
 from page_parts import size
 
 from leco_plugin.capacity.choice import best_gate
-from leco_plugin.chart.findings.learned import still_rising
-from leco_plugin.chart.findings.representations import (
+from leco_plugin.chart.learned import still_rising
+from leco_plugin.chart.representations import (
     SMALL_OURS,
     Representation,
     representations_of,
 )
-from leco_plugin.chart.findings.summary import Line, lines_of
+from leco_plugin.chart.summary import Line, lines_of
 
 Reports = Mapping[str, Any]
 """Results of `leco capacity`, by scene."""

@@ -17,7 +17,7 @@ from typing import Any
 import checkout  # noqa: F401
 
 from leco_plugin.chart.theme import LIGHT, SOURCE, Theme, fingerprint, plain, themed
-from leco_plugin.cli_reports import occupancy_of
+from leco_plugin.cli_occupancy import occupancy_of
 from leco_plugin.evaluation.history_picture import OPAQUE
 from leco_plugin.evaluation.report import describe_machine
 from leco_plugin.learning.history import FILE_NAME, GateHistory, as_learned

@@ -10,7 +10,7 @@ from typing import Any
 import checkout  # noqa: F401
 from page_parts import RESULTS, between, noted, table
 
-from leco_plugin.chart.findings.summary import Line, compare, lines_of
+from leco_plugin.chart.summary import Line, compare, lines_of
 
 DEMO = "<!-- demo table: generated -->", "<!-- end of the demo table -->"
 GAIN = "<!-- gain: generated -->", "<!-- end of the gain -->"

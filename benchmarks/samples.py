@@ -23,7 +23,7 @@ from measured_runs import main
 from timing import ratio, time_interleaved
 
 from leco_plugin.capacity.sources import find_source
-from leco_plugin.cli_reports import occupancy_of
+from leco_plugin.cli_occupancy import occupancy_of
 from leco_plugin.evaluation.queries import count_queries
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.samplers import marching

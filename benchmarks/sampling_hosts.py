@@ -11,7 +11,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.models.instant_ngp import InstantNGPModelConfig
 from sampling_scene import rays_into
 
-from leco_plugin.hosts.classes import Host, set_up_host
+from leco_plugin.hosts.guided import Host, set_up_host
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.rendering import Intervals, Rays, Routing, Scene, shade
 from leco_plugin.models.sizing.sizes import PAPER

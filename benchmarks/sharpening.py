@@ -33,7 +33,7 @@ from leco_plugin.capacity.sources import (
     find_source,
 )
 from leco_plugin.chart.table import spread
-from leco_plugin.cli_reports import occupancy_of
+from leco_plugin.cli_occupancy import occupancy_of
 from leco_plugin.evaluation.equal_loss import kept_shares, mapped_box, reached_volume
 from leco_plugin.evaluation.field_grids import dilate, look_up_scores
 from leco_plugin.evaluation.inspection import in_parts

@@ -8,7 +8,7 @@ from typing import Any
 
 import checkout  # noqa: F401
 
-from leco_plugin.chart.findings.summary import Verdict, compare
+from leco_plugin.chart.summary import Verdict, compare
 
 MAY_LOSE, MAY_HAVE, SMALL_AGAINST_LARGE = 0.1, 1.25, 0.25
 """dB below the best of the sweep and below a larger model, parameters of the best times this, and

@@ -18,7 +18,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from leco_plugin.cli_reports import occupancy_of
+from leco_plugin.cli_occupancy import occupancy_of
 from leco_plugin.evaluation.history_picture import write_film
 from leco_plugin.evaluation.inspection import candidates
 from leco_plugin.log import bar

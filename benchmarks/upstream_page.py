@@ -8,7 +8,7 @@ import checkout  # noqa: F401
 from chart_sections import notes, stored
 from page_parts import ROOT, between, table
 
-from leco_plugin.chart.findings.summary import MEMORY, RENDERING, Line, lines_of
+from leco_plugin.chart.summary import MEMORY, RENDERING, Line, lines_of
 
 PAGE = ROOT / "docs" / "upstream" / "leco_nerf.md"
 MARKS = "<!-- results: generated -->", "<!-- end of the results -->"

@@ -18,8 +18,8 @@ import tyro
 
 from leco_plugin.cli_experiments import capacity, chart, check, stability
 from leco_plugin.cli_occupancy import export, inspect, shrink
-from leco_plugin.cli_reports import check_json, write_json
 from leco_plugin.scenes.input_error import one_line
+from leco_plugin.scenes.whole_files import check_json, write_report
 
 BAD_INPUT, FAILURE = 2, 1
 FEW_PICTURES = 20
@@ -83,7 +83,7 @@ def city(
         levels = f"--ray-altitude-range {-1.3 * roof:.0f} {0.5 * roof:.0f}"
         command = f"{_training(folder, 'mega-nerf')} {levels}"
     print(f"train on it with: {command}")
-    write_json(json, facts)
+    write_report(json, facts)
 
 
 def poses(
@@ -114,7 +114,7 @@ def poses(
     report = make_scene(photos, out, lens, size, threads)
     print("\n".join(summary(report)))
     print(f"train on it with: {_training(out)}")
-    write_json(json, report)
+    write_report(json, report)
 
 
 def points(
@@ -144,7 +144,7 @@ def points(
         print(f"train on it with: {_training(data)}")
     else:
         print(f"{data} has {report['points']} sparse points already: nothing is done")
-    write_json(json, report)
+    write_report(json, report)
 
 
 def swap(
@@ -183,7 +183,7 @@ def swap(
     folder = config.get_base_dir()
     print(f"{method}, guided: {folder}")
     facts = {"method": method, "sampler": sampler, "options": dict(options), "codes": codes}
-    write_json(json, {"format": 1, **facts, "folder": str(folder)})
+    write_report(json, {"format": 1, **facts, "folder": str(folder)})
 
 
 def demo(
@@ -214,7 +214,7 @@ def demo(
     report = run_demo(out, seconds, quick, began)
     print("\n".join(summary(report)))
     print(f"see report.json, chart.png and picture.png in {out}")
-    write_json(json, report)
+    write_report(json, report)
 
 
 def _training(data: Path, *reader: str) -> str:

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from leco_plugin.cli_reports import check_json, write_json
+from leco_plugin.scenes.whole_files import check_json, write_report
 
 
 def chart(
@@ -68,7 +68,7 @@ def chart(
         drawn = "chart.png, chart.html, " if results["runs"] else ""
         print(f"see {drawn}table.md and results.json in {folder}")
     charts = {folder.name: results for folder, results in made.items()}
-    write_json(json, {"format": 1, "charts": charts} if len(made) > 1 else made[out])
+    write_report(json, {"format": 1, "charts": charts} if len(made) > 1 else made[out])
     refuse_failures(list(made.values()))
 
 
@@ -107,7 +107,7 @@ def stability(
     results = make_table(out, cases, samplers, seeds, seeds_beside, quick, minutes)
     print(headline(results))
     print(f"see stability.png, table.md, stability.json and failures in {out}")
-    write_json(json, results)
+    write_report(json, results)
     if blind(results) and not quick:
         raise RuntimeError(blind(results)[0])
 
@@ -139,7 +139,7 @@ def capacity(
     results = measure(data, out, grids, lost_surface_mass, learn_steps)
     print(results["verdict"])
     print(f"see capacity.png and results.json in {out}")
-    write_json(json, results)
+    write_report(json, results)
 
 
 def check(name: Annotated[str, tyro.conf.Positional], json: Path | None = None) -> None:
@@ -164,7 +164,7 @@ def check(name: Annotated[str, tyro.conf.Positional], json: Path | None = None) 
                 print(f"      said before: {line}")
             said.clear()
     rows = [verdict.to_dict() for verdict in verdicts]
-    write_json(json, {"format": 1, "name": name, "verdicts": rows})
+    write_report(json, {"format": 1, "name": name, "verdicts": rows})
     failed = sum(not verdict.passed for verdict in verdicts)
     if failed:
         raise RuntimeError(f"{name} breaks {failed} of {len(verdicts)} rules")

@@ -9,10 +9,32 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from leco_plugin.cli_reports import check_json, check_picture, occupancy_of, write_json
+from leco_plugin.scenes.whole_files import check_json, check_picture, write_report
 
 if TYPE_CHECKING:
     from leco_plugin.occupancy import Occupancy
+
+
+def occupancy_of(path: Path) -> Path:
+    """The file that is meant: itself, or the newest occupancy in a folder of runs.
+
+    Raises:
+        ValueError: there is neither, or none in the folder.
+    """
+    give = (
+        "give an occupancy.safetensors, or a folder with a run that left one, as "
+        "outputs/SCENE/leco-occupancy"
+    )
+    if not path.exists():
+        raise ValueError(f"there is no {path}: {give}")
+    if not path.is_dir():
+        return path
+    from leco_plugin.hosts.guided_start import occupancy_file
+
+    file = occupancy_file(path)
+    if file is None or not file.exists():
+        raise ValueError(f"there is no occupancy.safetensors in {path}: {give}")
+    return file
 
 
 def inspect(
@@ -65,7 +87,7 @@ def inspect(
 
         history.parent.mkdir(parents=True, exist_ok=True)
         print(f"drew {draw_history(occupancy, file.parent, history)}")
-    write_json(json, facts)
+    write_report(json, facts)
 
 
 def export(
@@ -110,13 +132,13 @@ def export(
     if format is not None:
         facts = made.export(file, format, out, resolution, levels, frame, data)
         print("\n".join(_export_in_words(out, facts, frame)))
-        write_json(json, facts)
+        write_report(json, facts)
         return
     if levels is not None or frame is not None:
         raise ValueError("--levels and --frame go with --format: give one, or leave them out")
     parts, doubted = made.export_folder(file, out, resolution, data)
     print("\n".join(made.in_words(out, parts, doubted)))
-    write_json(json, {"format": 1, "parts": {part.name: part.facts for part in parts}})
+    write_report(json, {"format": 1, "parts": {part.name: part.facts for part in parts}})
 
 
 def _export_in_words(out: Path, facts: dict[str, Any], frame: str | None) -> list[str]:
@@ -187,10 +209,10 @@ def shrink(
     check_picture("--picture", picture)
     bounds = Bounds(lost_surface_mass, image_price)
     results = find_smaller(
-        occupancy_of(file), data, out, bounds, keep=lambda known: write_json(json, known)
+        occupancy_of(file), data, out, bounds, keep=lambda known: write_report(json, known)
     )
     print("\n".join(summary(results, out)))
-    write_json(json, results)
+    write_report(json, results)
     if picture is not None:
         print(f"drew {draw_gates(results, picture)}")
 

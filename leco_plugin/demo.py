@@ -14,8 +14,8 @@ from typing import Any
 import torch
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
-from leco_plugin.chart.findings.summary import Line
 from leco_plugin.chart.picture import draw_curves, name_ends
+from leco_plugin.chart.summary import Line
 from leco_plugin.chart.theme import LIGHT, new_figure, save_picture, style, themed
 from leco_plugin.evaluation.clock import Budget
 from leco_plugin.evaluation.equal_loss import occupancy_facts, truth_of

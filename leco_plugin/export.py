@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool3d
 
-from leco_plugin.cli_reports import check_place
 from leco_plugin.evaluation.inspection import (
     cameras_of,
     describe,
@@ -54,7 +53,7 @@ from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.grid import OccupancyGridEstimator
 from leco_plugin.scenes.coloured_points import georeference
 from leco_plugin.scenes.frames import moved
-from leco_plugin.scenes.whole_files import write_whole
+from leco_plugin.scenes.whole_files import check_place, write_whole
 
 Format = Literal["ply", "splat-init", "npz", "nerfacc-grid"]
 Frame = Literal["data", "run"]

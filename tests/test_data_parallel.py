@@ -20,13 +20,13 @@ from torch import Tensor
 from leco_plugin.host_configs import leco_ngp
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.models.encodings import EncodingConfig
-from leco_plugin.models.failures import TrainingStopped
 from leco_plugin.models.field import FieldConfig
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.sizing.sizes import Sizes
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers import estimator
+from leco_plugin.scenes.input_error import TrainingStopped
 from leco_plugin.space import Space
 from leco_plugin.studio.checkpoints import allow_checkpoint_globals, newest_whole, step_of
 from leco_plugin.studio.processes import DataParallelTrainerConfig

@@ -18,9 +18,9 @@ from eight_questions import eight_answers
 from results_page import sampling_section
 
 from leco_plugin.capacity import choice
-from leco_plugin.chart.findings.learned import learned_of
-from leco_plugin.chart.findings.summary import lines_of
+from leco_plugin.chart.learned import learned_of
 from leco_plugin.chart.panels import title_of
+from leco_plugin.chart.summary import lines_of
 
 ROOT = Path(__file__).resolve().parents[1]
 STEPS = {"protocol": {"seconds": None, "steps": 400}}

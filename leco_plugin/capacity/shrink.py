@@ -38,7 +38,6 @@ from leco_plugin.capacity.sources import (
     draw_training_rays,
     find_source,
 )
-from leco_plugin.cli_reports import check_place
 from leco_plugin.evaluation.clock import synchronize
 from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.evaluation.report import describe_code, describe_machine, made_by
@@ -47,6 +46,7 @@ from leco_plugin.learning.sharpening import round_weights
 from leco_plugin.log import bar, put
 from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
 from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler
+from leco_plugin.scenes.whole_files import check_place
 
 RAYS = 4096
 TAUGHT_RAYS = 6144

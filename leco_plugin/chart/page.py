@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart.findings.learned import falls
-from leco_plugin.chart.findings.summary import Line, best_so_far, circumstances
+from leco_plugin.chart.learned import falls
 from leco_plugin.chart.panels import Panel, finding_of, shown_of, title_of
+from leco_plugin.chart.summary import Line, best_so_far, circumstances
 from leco_plugin.chart.theme import LIGHT, style, write_page_file
 
 SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x", "star")

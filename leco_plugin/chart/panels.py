@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from leco_plugin.chart.findings.learned import learned_headline, learned_of
-from leco_plugin.chart.findings.representations import (
+from leco_plugin.chart.learned import learned_headline, learned_of
+from leco_plugin.chart.representations import (
     SPARSE,
     Representation,
     never_held_of,
@@ -15,7 +15,7 @@ from leco_plugin.chart.findings.representations import (
     shortest_verdict,
     verdict,
 )
-from leco_plugin.chart.findings.summary import (
+from leco_plugin.chart.summary import (
     COSTS,
     LEARNING,
     Cost,

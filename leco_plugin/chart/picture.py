@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from leco_plugin.chart.findings.learned import learned_of
-from leco_plugin.chart.findings.summary import (
+from leco_plugin.chart.learned import learned_of
+from leco_plugin.chart.panels import Panel, Point, Shown, finding_of, shown_of, title_of
+from leco_plugin.chart.summary import (
     LEARNING,
     LOST_SURFACE_MASS,
     Line,
     best_so_far,
     circumstances,
 )
-from leco_plugin.chart.panels import Panel, Point, Shown, finding_of, shown_of, title_of
 from leco_plugin.chart.theme import (
     LIGHT,
     Theme,

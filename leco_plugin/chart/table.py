@@ -7,15 +7,16 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, TypeVar
 
-from leco_plugin.chart.findings.learned import Learned, falls, learned_of, settling
-from leco_plugin.chart.findings.representations import (
+from leco_plugin.chart.learned import Learned, falls, learned_of, settling
+from leco_plugin.chart.panels import cost_panel, finding_of
+from leco_plugin.chart.representations import (
     Representation,
     fronts_of,
     keeps_all,
     never_held_of,
     representations_of,
 )
-from leco_plugin.chart.findings.summary import (
+from leco_plugin.chart.summary import (
     COSTS,
     LEARNING,
     Cost,
@@ -27,7 +28,6 @@ from leco_plugin.chart.findings.summary import (
     rivals,
     sentence,
 )
-from leco_plugin.chart.panels import cost_panel, finding_of
 
 T = TypeVar("T")
 

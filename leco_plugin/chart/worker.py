@@ -147,7 +147,7 @@ def compare_at_freezing(model: Any, datamanager: Any, contender: Contender) -> d
     from leco_plugin.capacity.measuring import lesson_of, taught_grid, taught_score
     from leco_plugin.capacity.search import gates
     from leco_plugin.capacity.sources import Source
-    from leco_plugin.chart.findings.representations import SPARSE
+    from leco_plugin.chart.representations import SPARSE
     from leco_plugin.evaluation.clock import seconds_now
     from leco_plugin.learning.dense import evaluating
     from leco_plugin.scenes.survey import sparse_points

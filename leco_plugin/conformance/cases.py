@@ -13,8 +13,7 @@ from leco_plugin.conformance.proposals import ProposalCase
 from leco_plugin.conformance.rules import RULES, Case, Rule, Verdict, apply
 from leco_plugin.conformance.samplers import SamplerCase
 from leco_plugin.conformance.scene import SLAB
-from leco_plugin.entries import why_left_out
-from leco_plugin.samplers.registry import GROUP, SamplerSpec, sampler_spec, samplers
+from leco_plugin.samplers.registry import GROUP, SamplerSpec, sampler_spec, samplers, why_left_out
 from leco_plugin.scenes.input_error import InputError
 
 HOST_RULES = tuple(rule for rule in RULES if HostCase.seam in rule.checks)

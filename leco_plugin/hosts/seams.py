@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 from torch import nn
 
-from leco_plugin.entries import foreign_entries
 from leco_plugin.hosts.guide import Guide
 from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.nerfacc_cpu import install_for
+from leco_plugin.samplers.registry import foreign_entries
 from leco_plugin.scenes.input_error import InputError
 
 if TYPE_CHECKING:

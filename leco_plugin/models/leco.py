@@ -19,8 +19,8 @@ from leco_plugin.learning.run import Progress, Run
 from leco_plugin.learning.schedule import KEPT_ABOVE
 from leco_plugin.models import figures
 from leco_plugin.models.compute.device import fast_precision, keep_freed_memory
-from leco_plugin.models.failures import require_finite
 from leco_plugin.models.leco_config import LecoModelConfig
+from leco_plugin.models.losses import require_finite
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.objective import field_losses, gate_losses
 from leco_plugin.models.rendering import Intervals, Rays, Routing, Shaded

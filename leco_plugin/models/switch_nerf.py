@@ -16,8 +16,8 @@ from nerfstudio.models.base_model import Model
 from torch import Tensor, nn
 
 from leco_plugin.models.compute.device import fast_precision, keep_freed_memory
-from leco_plugin.models.failures import require_finite
 from leco_plugin.models.figures import image_figures, leading_expert, over_background, with_alpha
+from leco_plugin.models.losses import require_finite
 from leco_plugin.models.region import Region, marching_rule
 from leco_plugin.models.rendering import (
     Intervals,

@@ -1,4 +1,5 @@
-"""The error for what a user can mend: one line on the terminal, and no traceback."""
+"""What ends a command in one line and without a traceback: input that a user can mend, and a run
+that cannot go on."""
 
 from __future__ import annotations
 
@@ -11,6 +12,14 @@ class InputError(ValueError):
     """Something given to a command is wrong; the message names the cause and the remedy.
 
     It ends `leco` with this one line and status 2, and `ns-*` commands with it and status 1.
+    """
+
+
+class TrainingStopped(RuntimeError):
+    """A run cannot go on; the message says at which step, why, and what is left of it.
+
+    `AtomicTrainer` and nerfstudio's launcher raise it. A loop of one's own can catch it; `ns-*`
+    commands end with its one line and status 1, see `studio.commands`.
     """
 
 

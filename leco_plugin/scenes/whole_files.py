@@ -1,4 +1,5 @@
-"""Files that appear under their names only when they are whole, however a process ends."""
+"""Files that appear under their names only when they are whole, however a process ends; and whether
+one may be written, before work that takes minutes."""
 
 from __future__ import annotations
 
@@ -7,9 +8,10 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
-from numpy.typing import NDArray
+if TYPE_CHECKING:  # `leco --help` loads no numpy for it
+    from numpy.typing import NDArray
 
 PART = ".part"
 """How the names of unfinished files end."""
@@ -36,6 +38,12 @@ def write_json(path: Path, value: Any, indent: int = 2, allow_nan: bool = False)
     write_whole(path, lambda file: file.write(text.encode()))
 
 
+def write_report(path: Path | None, value: Any) -> None:
+    """`write_json` where a report was asked for."""
+    if path is not None:
+        write_json(path, value)
+
+
 def remove_parts(folder: Path) -> None:
     """Deletes what killed processes left half written in a folder and those below it."""
     for part in folder.rglob(f".*{PART}"):
@@ -55,3 +63,43 @@ def write_points(path: Path, rows: NDArray[Any], comments: Sequence[str] = ()) -
     encoding = "format binary_little_endian 1.0"
     head = ["ply", encoding, *said, count, *properties, "end_header\n"]
     write_whole(path, lambda file: file.write("\n".join(head).encode() + rows.tobytes()))
+
+
+def check_json(path: Path | None) -> None:
+    """Before work that takes minutes, whether its report has a place."""
+    check_place("--json", path)
+
+
+def check_place(option: str, path: Path | None) -> None:
+    """Whether a file may be written there, its folders made.
+
+    Raises:
+        ValueError: it is a folder, or one of its folders is a file or cannot be written to.
+    """
+    if path is None:
+        return
+    if path.is_dir():
+        raise ValueError(f"{option} {path} is a folder; give a file")
+    nearest = next(folder for folder in path.absolute().parents if folder.exists())
+    if not nearest.is_dir():
+        raise ValueError(f"{option} {path}: {nearest} is a file, not a folder")
+    if not os.access(nearest, os.W_OK):
+        raise ValueError(f"{option} {path}: {nearest} cannot be written to")
+
+
+def check_picture(option: str, path: Path | None, moving: bool = False) -> None:
+    """As `check_place`, and whether a picture of this kind can be drawn.
+
+    Args:
+        moving: whether a .gif may be asked for, too.
+    Raises:
+        ValueError: as `check_place`, or its kind is not known.
+    """
+    check_place(option, path)
+    if path is None:
+        return
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    kinds = {*FigureCanvasBase.get_supported_filetypes(), *(["gif"] if moving else [])}
+    if path.suffix[1:].lower() not in kinds:
+        raise ValueError(f"{option} {path} ends in none of {', '.join(sorted(kinds))}")

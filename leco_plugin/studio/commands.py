@@ -17,8 +17,7 @@ from traceback import walk_tb
 from types import FrameType, TracebackType
 from typing import Any
 
-from leco_plugin.models.failures import TrainingStopped
-from leco_plugin.scenes.input_error import ANOTHER_VERSION, InputError
+from leco_plugin.scenes.input_error import ANOTHER_VERSION, InputError, TrainingStopped
 
 PACKAGE = "leco_plugin"
 

@@ -20,8 +20,7 @@ from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
 from torch.nn.parallel import DistributedDataParallel
 
 from leco_plugin.log import say
-from leco_plugin.models.failures import TrainingStopped
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, TrainingStopped
 from leco_plugin.studio.checkpoints import follow_data
 from leco_plugin.studio.run_folder import claim
 from leco_plugin.studio.run_progress import is_short, short_screen

@@ -22,9 +22,8 @@ from leco_plugin.learning.collapse import GateCollapsed
 from leco_plugin.learning.run import Progress
 from leco_plugin.log import say, say_what_is_logged
 from leco_plugin.models.compute.ranks import is_first
-from leco_plugin.models.failures import TrainingStopped
 from leco_plugin.samplers.kernels import VARIABLE, kernels_off
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, TrainingStopped
 from leco_plugin.studio.checkpoints import first_not_finite, previous_of, step_of, whole_of
 from leco_plugin.studio.run_folder import (
     check_photographs,

@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from page_text import figure_text
 
-from leco_plugin.chart.findings.learned import falls, last_gain, settling, still_rising
-from leco_plugin.chart.findings.summary import (
+from leco_plugin.chart.learned import falls, last_gain, settling, still_rising
+from leco_plugin.chart.page import write_page
+from leco_plugin.chart.summary import (
     KEPT,
     MEMORY,
     RENDERING,
@@ -23,7 +24,6 @@ from leco_plugin.chart.findings.summary import (
     rivals,
     seconds_to_pass,
 )
-from leco_plugin.chart.page import write_page
 from leco_plugin.chart.table import table
 
 

@@ -8,10 +8,10 @@ import pytest
 from chart_results import occupancy, results, run
 from PIL import Image
 
-from leco_plugin.chart.findings.learned import learned_headline, learned_of, words_of
-from leco_plugin.chart.findings.summary import lines_of
+from leco_plugin.chart.learned import learned_headline, learned_of, words_of
 from leco_plugin.chart.panels import finding_of
 from leco_plugin.chart.picture import draw
+from leco_plugin.chart.summary import lines_of
 from leco_plugin.chart.table import table
 
 BY_STEPS = {"suite": "losses", "protocol": {"seconds": None, "steps": 400}}

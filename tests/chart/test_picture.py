@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from page_text import figure_text
 from PIL import Image
 
-from leco_plugin.chart.findings.summary import best_so_far, lines_of
 from leco_plugin.chart.page import write_page
 from leco_plugin.chart.picture import (
     balanced,
@@ -22,6 +21,7 @@ from leco_plugin.chart.picture import (
     name_points,
     rims,
 )
+from leco_plugin.chart.summary import best_so_far, lines_of
 from leco_plugin.chart.theme import DARK, LIGHT, SOURCE, Theme, fingerprint
 
 RUNS = [

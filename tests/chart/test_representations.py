@@ -7,7 +7,8 @@ from chart_results import grid, occupancy, results, run, slow_front
 from hypothesis import given
 from hypothesis import strategies as st
 
-from leco_plugin.chart.findings.representations import (
+from leco_plugin.chart.panels import finding_of
+from leco_plugin.chart.representations import (
     SMALL_OURS,
     Held,
     Representation,
@@ -15,8 +16,7 @@ from leco_plugin.chart.findings.representations import (
     representations_of,
     verdict,
 )
-from leco_plugin.chart.findings.summary import lines_of
-from leco_plugin.chart.panels import finding_of
+from leco_plugin.chart.summary import lines_of
 from leco_plugin.chart.table import table
 
 GRIDS = [grid(64, 0.3), grid(128, 0.2)]

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from leco_plugin.chart.findings.summary import compare
+from leco_plugin.chart.summary import compare
 
 NAN, OPEN = math.nan, "undecided"
 SPREAD = st.lists(st.integers(0, 9).map(float), min_size=2, max_size=6)

@@ -13,8 +13,8 @@ from ball_occupancy import ball
 from nerfstudio.model_components.renderers import RGBRenderer
 
 from leco_plugin.hosts import host_watch
-from leco_plugin.hosts.classes import GuidedHost
 from leco_plugin.hosts.guide import Guide
+from leco_plugin.hosts.guided import GuidedHost
 from leco_plugin.hosts.host_watch import (
     CAREFUL,
     LOWERED_TO,

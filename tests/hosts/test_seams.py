@@ -14,8 +14,8 @@ from nerfstudio.model_components.ray_samplers import (
 )
 from torch import nn
 
-from leco_plugin.hosts.classes import GuidedHost
 from leco_plugin.hosts.guide import Guide
+from leco_plugin.hosts.guided import GuidedHost
 from leco_plugin.hosts.guided_start import OccupancyConfig
 from leco_plugin.hosts.seams import no_density, swap_sampler
 from leco_plugin.hosts.stand_ins import GuidedEstimator, GuidedProposal

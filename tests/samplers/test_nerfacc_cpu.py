@@ -237,7 +237,7 @@ def test_stock_instant_ngp_trains_and_renders():
     from nerfstudio.data.scene_box import SceneBox
     from nerfstudio.models.instant_ngp import InstantNGPModelConfig
 
-    from leco_plugin.hosts.classes import Host, set_up_host
+    from leco_plugin.hosts.guided import Host, set_up_host
 
     torch.manual_seed(0)
     config = InstantNGPModelConfig(

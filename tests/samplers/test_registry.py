@@ -184,7 +184,7 @@ def test_entry_points_of_other_packages_are_found_and_broken_ones_left_out(monke
         EntryPoint("builder", f"{here}:build_dense", registry.GROUP),  # no SamplerSpec
         EntryPoint("dense", "no_such_module:spec", registry.GROUP),  # ours stay ours
     ]
-    monkeypatch.setattr("leco_plugin.entries.entry_points", lambda group: entries)
+    monkeypatch.setattr("leco_plugin.samplers.registry.entry_points", lambda group: entries)
     monkeypatch.setattr(registry, "FOREIGN", FOREIGN, raising=False)
     with pytest.warns(UserWarning, match="leco_plugin.samplers '(broken|builder)' is left out"):
         found = samplers()
@@ -213,7 +213,7 @@ def test_a_module_that_ends_the_process_or_talks_at_length_is_left_out_in_a_line
     (tmp_path / "a_foreign_sampler.py").write_text(body)
     monkeypatch.syspath_prepend(tmp_path)
     entry = EntryPoint("foreign", "a_foreign_sampler:SPEC", registry.GROUP)
-    monkeypatch.setattr("leco_plugin.entries.entry_points", lambda group: [entry])
+    monkeypatch.setattr("leco_plugin.samplers.registry.entry_points", lambda group: [entry])
     with pytest.warns(UserWarning) as warned:
         assert set(samplers()) == set(registry.OURS)
     (message,) = [str(each.message) for each in warned]

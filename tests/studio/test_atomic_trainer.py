@@ -15,9 +15,8 @@ import pytest
 import torch
 from nerfstudio.engine.trainer import Trainer
 
-from leco_plugin.models.failures import TrainingStopped
 from leco_plugin.samplers.kernels import VARIABLE
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, TrainingStopped
 from leco_plugin.studio import trainer as atomic_trainer
 from leco_plugin.studio.checkpoints import damage_of
 from leco_plugin.studio.trainer import AtomicTrainer, _say_which_kernels_are_off

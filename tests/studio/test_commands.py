@@ -18,8 +18,7 @@ from nerfstudio.utils import install_checks
 from nerfstudio.utils.eval_utils import eval_setup
 
 from leco_plugin.method_configs import leco_occupancy
-from leco_plugin.models.failures import TrainingStopped
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, TrainingStopped
 from leco_plugin.studio.commands import (
     is_ns_command,
     line_of,

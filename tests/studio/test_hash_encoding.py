@@ -17,8 +17,7 @@ from nerfstudio.models.nerfacto import NerfactoModelConfig
 from small_hosts import what_a_model_gets
 from torch import Tensor, nn
 
-from leco_plugin.hosts.classes import Host, set_up_host
-from leco_plugin.hosts.guided import GuidedModelConfig
+from leco_plugin.hosts.guided import GuidedModelConfig, Host, set_up_host
 from leco_plugin.hosts.guided_start import OWN_SAMPLER, OccupancyConfig
 from leco_plugin.models.compute.native import has_native
 from leco_plugin.samplers.kernels import VARIABLE

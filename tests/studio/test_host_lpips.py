@@ -16,7 +16,7 @@ from small_hosts import what_a_model_gets
 from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
 from leco_plugin.evaluation import metrics
-from leco_plugin.hosts.classes import Host, set_up_host
+from leco_plugin.hosts.guided import Host, set_up_host
 from leco_plugin.studio.host_models import LazyLpipsNetwork, lazy_lpips
 
 

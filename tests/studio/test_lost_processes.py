@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
 
-from leco_plugin.models.failures import TrainingStopped
+from leco_plugin.scenes.input_error import TrainingStopped
 from leco_plugin.studio.processes import _with_one_line
 
 
@@ -52,7 +52,7 @@ def test_a_lost_process_is_named_with_what_is_left(
 
 
 def test_the_line_of_a_process_that_stopped_itself_is_the_line_of_the_run() -> None:
-    error = raised("leco_plugin.models.failures.TrainingStopped: step 3: a reason: another")
+    error = raised("leco_plugin.scenes.input_error.TrainingStopped: step 3: a reason: another")
     with pytest.raises(TrainingStopped, match=r"^step 3: a reason: another$"):
         launching(error)(config=config_of(Path()))
 

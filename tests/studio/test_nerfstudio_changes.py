@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
-from leco_plugin.models.failures import TrainingStopped
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, TrainingStopped
 from leco_plugin.studio import run_folder as nerfstudio_changes
 from leco_plugin.studio import trainer as atomic_trainer
 from leco_plugin.studio.run_folder import (

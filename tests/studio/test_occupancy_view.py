@@ -16,8 +16,8 @@ from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException
 from tiny_run import tiny_trainer
 from torch import nn
 
-from leco_plugin.hosts.classes import GuidedHost
 from leco_plugin.hosts.guide import Guide
+from leco_plugin.hosts.guided import GuidedHost
 from leco_plugin.hosts.guided_start import OccupancyConfig
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig

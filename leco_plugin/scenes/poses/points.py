@@ -17,7 +17,6 @@ from nerfstudio.cameras.cameras import CameraType
 from numpy.typing import NDArray
 from PIL import Image
 
-from leco_plugin.cli_reports import check_place
 from leco_plugin.log import bar
 from leco_plugin.scenes.bounds import FEWEST_POINTS
 from leco_plugin.scenes.input_error import InputError, require
@@ -40,7 +39,7 @@ from leco_plugin.scenes.poses.reconstruction import (
     load_pycolmap,
 )
 from leco_plugin.scenes.scene_file import SceneFile, scene_file_of
-from leco_plugin.scenes.whole_files import write_json, write_whole
+from leco_plugin.scenes.whole_files import check_place, write_json, write_whole
 
 Array = NDArray[np.float64]
 FILE, BEFORE = "leco_points.ply", "transforms.before_points.json"

@@ -149,7 +149,7 @@ def test_pairs_by_pose_are_near_ones_that_look_the_same_way() -> None:
 def test_a_scene_that_cannot_be_written_to_is_refused_before_the_work(
     bare: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("leco_plugin.cli_reports.os.access", lambda *_: False)
+    monkeypatch.setattr("leco_plugin.scenes.whole_files.os.access", lambda *_: False)
     monkeypatch.setattr("leco_plugin.scenes.poses.points._copies", None)
     with pytest.raises(ValueError, match="cannot be written to"):
         find_points(bare)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from leco_plugin.chart.findings.summary import Line, compare, figure_in, middle_of
+from leco_plugin.chart.summary import Line, compare, figure_in, middle_of
 
 OURS = "(ours)"
 """Marks the contender that a suite asks about."""

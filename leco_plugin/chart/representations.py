@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from leco_plugin.chart.contender import LEARNED
-from leco_plugin.chart.findings.summary import KEPT, LEARNING, Line, Verdict, compare
+from leco_plugin.chart.summary import KEPT, LEARNING, Line, Verdict, compare
 
 OUR_KIND = "MLP"
 """Kind of the default gate."""

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from leco_plugin.models.failures import explain_non_finite, first_non_finite
+from leco_plugin.models.losses import explain_non_finite, first_non_finite
 
 
 def sound() -> tuple[torch.nn.Module, dict[str, Any], torch.Tensor]:

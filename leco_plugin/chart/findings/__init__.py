@@ -1,1 +1,0 @@
-"""What runs say together: who is ahead, what was learned, whether the time was enough."""
