@@ -262,7 +262,7 @@ def headline(results: Mapping[str, Any], short: bool = False) -> str:
             if lead.word == "ahead":  # then it has a margin
                 beyond = f"{lead.difference:.2f} ± {lead.margin:.2f}"
                 if short:
-                    return f"two with learned occupancy lead by {beyond} dB"
+                    return f"two methods with learned occupancy lead by {beyond} dB"
                 return f"{said}; {others[0].name}, the best of the others, is {beyond} behind"
         if not short:
             return said
