@@ -24,7 +24,7 @@ from learning import sentence as learning_sentence
 from page_parts import RESULTS, ROOT, machine_line, made_line, noted, picture, section, table
 from page_pictures import GROWTH, LEARNING, draw_pictures, is_stale, pictures
 from profile_page import profile_sections
-from readme_parts import GAIN_CHART, GIFTS_CHART, demo_table, gain, gifts_sentence, readme
+from readme_parts import GAIN_CHART, GIFTS_CHART, demo_table, gain, gains, gifts_sentence, readme
 from sharpening import sharpening_sections
 from sizes_sections import scene_results, sizes_sections
 from sizes_tables import where_it_pays
@@ -34,10 +34,14 @@ from stability_page import page as stability_page
 from upstream_page import PAGE as UPSTREAM_PAGE
 from upstream_page import page as upstream_page
 
+from leco_plugin.chart.summary import lines_of
+
 PAGE = ROOT / "docs" / "results.md"
 MEASUREMENTS_PAGE = ROOT / "docs" / "measurements.md"
 SUITES_PAGE = ROOT / "docs" / "suites.md"
 README = ROOT / "README.md"
+STRETCH_CHART = "caliterra-stretch"
+"""As the chart of the gain, in benchmarks/results/charts, tested on a stretch of the flight."""
 
 HEAD = """# Results
 
@@ -53,6 +57,8 @@ GAIN_NOTE = """The picture shows the same runs over time ([figures](measurements
 learning what is empty takes part of the time, and wins it back. On a CPU hosts are smaller than
 nerfstudio's: a hash table of 2^16 entries, a grid of 64³, 128 + 64 proposal samples and 32 of the
 field.
+
+{stretch}
 
 {gifts}
 
@@ -236,13 +242,25 @@ def growth_section() -> list[str]:
     return [head, f"{picture(GROWTH.stem)}\n", *rest]
 
 
+def new_views() -> str:
+    """What is gained on photographs of a stretch that no other one shows so."""
+    chart = json.loads((RESULTS / "charts" / f"{STRETCH_CHART}.json").read_text())
+    lines, anchor = lines_of(chart), heading_anchor(titles()[STRETCH_CHART])
+    seeds = max(len(line.runs) for line in lines)
+    return (
+        f"**On new views,** a whole stretch of {len(chart['held_out']['test'])} cameras held out "
+        f"with those beside it ([figures](measurements.md#{anchor}), {seeds} seeds), "
+        f"{gains(lines)}"
+    )
+
+
 def page() -> str:
     """The whole of `docs/results.md`."""
     demo = json.loads((RESULTS / "demo.json").read_text())
     anchor = heading_anchor(titles()[GAIN_CHART])
     chart = json.loads((RESULTS / "charts" / f"{GIFTS_CHART}.json").read_text())
     gifts = gifts_sentence(chart, heading_anchor(titles()[GIFTS_CHART]))
-    note = GAIN_NOTE.format(anchor=anchor, gifts=gifts)
+    note = GAIN_NOTE.format(anchor=anchor, gifts=gifts, stretch=new_views())
     parts = [HEAD, f"{gain()}\n", f"{picture(GAIN_CHART)}\n", note]
     parts += [
         f"{demo_table(demo)}\n",
