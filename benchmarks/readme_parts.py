@@ -45,10 +45,10 @@ def gain(also: str = "") -> str:
 
 def without_gifts(results: Mapping[str, Any]) -> str:
     """What a learned row of the gain has without what else it gets beside its gate."""
-    without = _psnrs(lines_of(results)[1])
+    _, without, own = map(_psnrs, lines_of(results))
     return (
-        "Part of Instant-NGP's lead is how its run begins: without its opaque and careful start, "
-        f"distances of sparse points and bounds, three runs end at {without} dB "
+        "Part of Instant-NGP's lead is how its run begins: with gate and bounds alone, runs end at "
+        f"{without} dB, with its own grid at {own} "
         "([more](docs/results.md#what-is-gained-in-the-same-time))."
     )
 
@@ -113,7 +113,8 @@ def gifts_sentence(results: Mapping[str, Any], anchor: str) -> str:
     return (
         "The learned row of Instant-NGP gets more than a gate: an opaque start, a careful one, "
         f"bounds and distances of sparse points. [Seed by seed](measurements.md#{anchor}), after "
-        f"{results['protocol']['seconds']:g} s: {learned} dB with all of it, {without} without, "
+        f"{results['protocol']['seconds']:g} s: {learned} dB with all of it, {without} with gate "
+        "and bounds alone, "
         f"{own} with its own grid. A host that begins transparent may never find a surface: that "
         "is what the opaque start is for. A grid keeps the whole box at first, and is opaque by "
         "itself. [Who gets what](gifts.md)."
@@ -141,7 +142,8 @@ def _beside(ours: Line, rival: Line, host: str) -> str:
     word = STANDS.get(found.word, "beside")
     by = f"{abs(found.difference) if found.word in CLEAR else found.difference:.1f}"
     margin = f"± {found.margin:.1f} dB" if found.margin is not None else f"dB, {found.by}"
-    return f"{word} *{name}* by {by} {margin} (renders {times:.1f} times as fast)"
+    speed = f"{times:.1f} times as fast" if times >= 1.0 else f"{1.0 / times:.1f} times as slowly"
+    return f"{word} *{name}* by {by} {margin} (renders {speed})"
 
 
 def _psnrs(line: Line) -> str:

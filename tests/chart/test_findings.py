@@ -96,7 +96,8 @@ def test_where_two_that_learn_are_level_the_headline_says_what_they_lead_the_oth
     both = of("A", 21.4, 21.5, 21.6) + of("B", 21.3, 21.5, 21.6)
     dense, grid = {"sampler": "dense"}, {"sampler": "own"}
     ahead = results(*both, *of("C", 20.0, 20.1, 19.9, **dense), *of("D", 19.0, 19.1, 18.9, **grid))
-    assert headline(ahead, short=True) == "two methods with learned occupancy lead by 1.50 ± 0.23 dB"
+    said = "two methods with learned occupancy lead by 1.50 ± 0.23 dB"
+    assert headline(ahead, short=True) == said
     assert headline(ahead).endswith("; C, the best of the others, is 1.50 ± 0.23 behind")
     close = results(*both, *of("C", 18.0, 22.0, 23.0, **dense))
     assert headline(close, short=True) == "A is level with the next best"
