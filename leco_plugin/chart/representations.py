@@ -15,7 +15,7 @@ OUR_KIND = "MLP"
 SMALL_OURS = "small MLP (ours)"
 """The small gate of that kind, which the trained field taught."""
 SPARSE = "sparse points"
-"""What is near one of the scene's is kept. Tables have it, pictures do not: it mostly keeps far more."""
+"""What is near one of the scene's is kept. In tables, not in pictures: it mostly keeps far more."""
 BYTES_A_NUMBER = 2
 """In bfloat16, in which gates are asked on a CPU."""
 COSTS = {"size": "size", "learning time": "learn_seconds"}
