@@ -86,7 +86,7 @@ def in_short(charts: Sequence[Mapping[str, Any]]) -> str:
     figures = {_kind(results)[0] for results in charts}
     if KEPT in figures:
         return _fronts(charts)
-    of = f"{len(charts)} scene{'s' if len(charts) > 1 else ''}"
+    of = scenes_of(charts)
     if LEARNED in figures:
         best = sum(_none_is_better(learned_of(lines_of(results))) for results in charts)
         return (
@@ -100,6 +100,11 @@ def in_short(charts: Sequence[Mapping[str, Any]]) -> str:
     rest = [f"{word} on {count}" for word, count in counts.items() if count]
     said = f"*{ours}* is ahead of the best other on {ahead or 'none'} of {of}"
     return ", ".join([said, *rest]) + "."
+
+
+def scenes_of(charts: Sequence[Any]) -> str:
+    """How many scenes there are charts of, in words."""
+    return f"{len(charts)} scene{'s' if len(charts) > 1 else ''}"
 
 
 def _none_is_better(learned: Sequence[Learned]) -> bool:
@@ -174,7 +179,7 @@ def _fronts(charts: Sequence[Mapping[str, Any]]) -> str:
             its = counts.setdefault(one.name, dict.fromkeys(COSTS, 0))
             for name in fronts_of(one, held):
                 its[name] += 1
-    of = f"{len(charts)} scene{'s' if len(charts) > 1 else ''}"
+    of = scenes_of(charts)
     said = [
         f"{sentence(who)}: on {its['size']} of {of} nothing as small keeps less space, on "
         f"{its['learning time']} nothing that is learned as soon."

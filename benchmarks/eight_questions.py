@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import checkout  # noqa: F401
-from answers import in_short
+from answers import in_short, scenes_of
 from chart_sections import by_scene, notes
 from growth_picture import cities, finding
-from page_parts import size
+from page_parts import size, span
+from sizes_tables import chosen_of
 
-from leco_plugin.capacity.choice import best_gate
 from leco_plugin.chart.learned import still_rising
 from leco_plugin.chart.representations import (
     SMALL_OURS,
@@ -39,29 +39,17 @@ def eight_answers(reports: Reports) -> list[str]:
         charts = by_scene(suite)
         mark = " (*)" if any(name in notes() for name, _ in charts.values()) else ""
         text = answer([results for _, results in charts.values()]) if charts else "Not measured."
-        said.append(f"{question}{mark} {text}")
+        said.append((f"**{question}**{mark}", text))
     said += [
-        f"How large may a scene be, and when does it stop paying? {_scenes(reports)}",
-        "What happens over training? [A film](measurements.md#while-an-occupancy-is-learned) shows "
-        "o(x), and the share and density of each expert, step by step. `leco inspect RUN --history "
-        "learned.gif` draws it of any run.",
+        ("**How large may a scene be, and when does it stop paying?**", _scenes(reports)),
+        (
+            "**What happens over training?**",
+            "[A film](measurements.md#while-an-occupancy-is-learned) shows o(x), and the share and "
+            "density of each expert, step by step. `leco inspect RUN --history learned.gif` draws "
+            "it of any run.",
+        ),
     ]
-    return [f"{number}. {_bold_question(one)}" for number, one in enumerate(said, start=1)]
-
-
-def _bold_question(said: str) -> str:
-    question, answer = said.split("?", 1)
-    return f"**{question}?**{answer}"
-
-
-def _span(values: Iterable[float], form: str = ".1f") -> str:
-    known = [*values]
-    low, high = format(min(known), form), format(max(known), form)
-    return low if low == high else f"{low} to {high}"
-
-
-def _many(charts: Sequence[Any]) -> str:
-    return f"{len(charts)} scene{'s' if len(charts) > 1 else ''}"
+    return [f"{number}. {' '.join(one)}" for number, one in enumerate(said, start=1)]
 
 
 def _held(charts: Sequence[Mapping[str, Any]]) -> list[list[Representation]]:
@@ -82,15 +70,15 @@ def _places(charts: Sequence[Mapping[str, Any]]) -> str:
     for name, belongs in others.items():
         pairs = [(ours, one) for ours, some in zip(small, held) for one in some if belongs(one)]
         if pairs:
-            times = _span(one.kept / ours.kept for ours, one in pairs)
+            times = span(one.kept / ours.kept for ours, one in pairs)
             smallest, largest = sorted((one.median("size") for _, one in pairs))[:: len(pairs) - 1]
             parts.append(
                 f"{name} of {size(smallest)} to {size(largest)} keep {times} times as much"
             )
     return (
-        f"None is best everywhere. A small MLP of {_span(one.median('size') for one in small)} kB "
-        f"that the trained field has taught keeps {_span(one.kept for one in small)}% of the space "
-        f"in {_many(charts)}; {', '.join(parts)}."
+        f"None is best everywhere. A small MLP of {span(one.median('size') for one in small)} kB "
+        f"that the trained field has taught keeps {span(one.kept for one in small)}% of the space "
+        f"in {scenes_of(charts)}; {', '.join(parts)}."
     )
 
 
@@ -105,11 +93,11 @@ def _seconds(charts: Sequence[Mapping[str, Any]]) -> str:
         kind = taught or ("small gate" if one.kind else "grid of densities" * one.is_grid)
         if kind:
             beyond[kind].append(one.median("beyond"))
-    more = [f"a {kind} {_span(some, '.0f')} s" for kind, some in beyond.items() if some]
+    more = [f"a {kind} {span(some, '.0f')} s" for kind, some in beyond.items() if some]
     return (
-        f"Our gate is learned in {_span((one.median('learn_seconds') for one in ours), '.0f')} s "
+        f"Our gate is learned in {span((one.median('learn_seconds') for one in ours), '.0f')} s "
         f"of a core, gates on hash grids and planes in "
-        f"{_span((one.median('learn_seconds') for one in rest), '.0f')}. From a field that has "
+        f"{span((one.median('learn_seconds') for one in rest), '.0f')}. From a field that has "
         f"learned, more is made: {', '.join(more)}. A GPU was not measured."
     )
 
@@ -130,7 +118,7 @@ def _row(lines: Sequence[Line], name: str) -> Line:
 def _above(charts: Sequence[Mapping[str, Any]], one: str, other: str) -> str:
     """By how many dB the mean of a row is above that of another, from scene to scene."""
     pairs = zip(_psnrs(charts, one), _psnrs(charts, other))
-    return f"{_span((ours - theirs for ours, theirs in pairs), '+.1f')} dB"
+    return f"{span((ours - theirs for ours, theirs in pairs), '+.1f')} dB"
 
 
 def _size_of_the_empty(charts: Sequence[Mapping[str, Any]]) -> str:
@@ -156,7 +144,7 @@ def _enough(charts: Sequence[Mapping[str, Any]]) -> str:
     seconds = charts[0]["protocol"]["seconds"]
     return (
         "For equal time see the first table. Enough time is open: Switch-NeRF's runs of "
-        f"{seconds:g} s still rise with a learned occupancy on {rising} of {_many(charts)}. "
+        f"{seconds:g} s still rise with a learned occupancy on {rising} of {scenes_of(charts)}. "
         f"{in_short(charts)}"
     )
 
@@ -169,16 +157,15 @@ def _no_empty(charts: Sequence[Mapping[str, Any]]) -> str:
     )
     return (
         "Then density is zero where the gate says empty, and nothing corrects a gate that is "
-        f"wrong. The identity ends {_above(charts, ours, none)} above that on {_many(charts)}; one "
-        f"run without it ended {worst:.1f} dB below."
+        f"wrong. The identity ends {_above(charts, ours, none)} above that on {scenes_of(charts)}; "
+        f"one run without it ended {worst:.1f} dB below."
     )
 
 
 def _scenes(reports: Reports) -> str:
-    kept = {name: best_gate(report["representations"]) for name, report in reports.items()}
-    full = max(kept, key=lambda name: (kept[name] or {}).get("kept_volume", 0.0))
-    most = (kept[full] or {}).get("kept_volume", 0.0)
+    kept = {name: chosen_of(report)[0]["kept_volume"] for name, report in reports.items()}
+    full = max(kept, key=lambda name: kept[name])
     return (
         f"{finding(cities(reports))} It pays least where a scene fills its box: on `{full}` the "
-        f"gate keeps {most:.0%}."
+        f"gate keeps {kept[full]:.0%}."
     )

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import checkout  # noqa: F401
-from page_parts import table
+from page_parts import span, table
 from sizes_tables import chosen_of
 
 from leco_plugin.capacity.choice import Row, kilobytes, stored_bytes
@@ -92,25 +92,20 @@ def growth_table(reports: Reports) -> str:
 def finding(grown: Sequence[Grown]) -> str:
     """What the cities show, in two sentences."""
     first, last = grown[0], grown[-1]
-    kept = f"{_span([100 * one.gate['kept_volume'] for one in grown])}% of the volume"
-    times = f"{_span([one.times for one in grown])} times as much"
+    kept = f"{span([100 * one.gate['kept_volume'] for one in grown])}% of the volume"
+    times = f"{span([one.times for one in grown])} times as much"
     octrees = [stored_bytes(one.grid) / 1000 for one in grown]
     return (
         f"From {first.blocks} to {last.blocks} blocks a side the gate takes "
-        f"{_span([one.gate['bytes'] / 1000 for one in grown])} kB and keeps {kept}. A grid with "
-        f"the same lesson, chosen by the same rule, takes {_span(octrees)} kB as an octree and "
+        f"{span([one.gate['bytes'] / 1000 for one in grown])} kB and keeps {kept}. A grid with "
+        f"the same lesson, chosen by the same rule, takes {span(octrees)} kB as an octree and "
         f"keeps {times}. Neither follows the area."
     )
 
 
 def headline(grown: Sequence[Grown]) -> str:
     """The finding in ten words at most."""
-    return f"An octree keeps {_span([one.times for one in grown])} times a gate's volume"
-
-
-def _span(values: Sequence[float]) -> str:
-    low, high = (f"{value:,.1f}" for value in (min(values), max(values)))
-    return low if low == high else f"{low} to {high}"
+    return f"An octree keeps {span([one.times for one in grown])} times a gate's volume"
 
 
 def draw(path: Path, reports: Reports, theme: Theme = LIGHT) -> Path:

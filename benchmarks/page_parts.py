@@ -55,6 +55,13 @@ def size(kilobytes: float) -> str:
     return f"{kilobytes:.{0 if kilobytes >= 10.0 else 1}f} kB"
 
 
+def span(values: Iterable[float], form: str = ",.1f") -> str:
+    """The least and the most of some values, in words."""
+    known = [*values]
+    low, high = format(min(known), form), format(max(known), form)
+    return low if low == high else f"{low} to {high}"
+
+
 def picture(name: str) -> str:
     """A picture in the page, in the page's colours."""
     image = f"images/charts/{name}"

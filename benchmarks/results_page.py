@@ -16,7 +16,7 @@ from typing import Any
 import checkout  # noqa: F401
 from answers import answers_section
 from bars import bars_section
-from chart_sections import chart_sections, suite_sections, titles
+from chart_sections import chart_sections, stored, suite_sections, titles
 from eight_questions import eight_answers
 from growth_picture import cities, growth_table
 from large_scene_tables import LARGE_SCENES
@@ -244,7 +244,7 @@ def growth_section() -> list[str]:
 
 def new_views() -> str:
     """What is gained on photographs of a stretch that no other one shows so."""
-    chart = json.loads((RESULTS / "charts" / f"{STRETCH_CHART}.json").read_text())
+    chart = stored(STRETCH_CHART)
     lines, anchor = lines_of(chart), heading_anchor(titles()[STRETCH_CHART])
     seeds = max(len(line.runs) for line in lines)
     return (
@@ -258,8 +258,7 @@ def page() -> str:
     """The whole of `docs/results.md`."""
     demo = json.loads((RESULTS / "demo.json").read_text())
     anchor = heading_anchor(titles()[GAIN_CHART])
-    chart = json.loads((RESULTS / "charts" / f"{GIFTS_CHART}.json").read_text())
-    gifts = gifts_sentence(chart, heading_anchor(titles()[GIFTS_CHART]))
+    gifts = gifts_sentence(stored(GIFTS_CHART), heading_anchor(titles()[GIFTS_CHART]))
     note = GAIN_NOTE.format(anchor=anchor, gifts=gifts, stretch=new_views())
     parts = [HEAD, f"{gain()}\n", f"{picture(GAIN_CHART)}\n", note]
     parts += [

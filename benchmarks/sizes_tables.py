@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Mapping
 from typing import Any
 
-from page_parts import table
+from page_parts import span, table
 from sizes_figures import MAY_LOSE, bars, verdict
 
 from leco_plugin.capacity.choice import best_gate, choose, kilobytes, stored_bytes
@@ -182,11 +182,12 @@ def where_it_pays(reports: Mapping[str, Report]) -> str:
     grids = [scene for scene, pair in pairs.items() if choose(pair) is pair[1]]
     gates = [scene for scene in pairs if scene not in grids]
     times = [grid["kept_volume"] / gate["kept_volume"] for gate, grid in pairs.values()]
-    sizes = [[stored_bytes(row) / 1000 for row in some] for some in zip(*pairs.values())]
-    ours, octrees = (f"{min(some):.1f} to {max(some):.1f} kB" for some in sizes)
+    ours, octrees = (
+        f"{span(stored_bytes(row) / 1000 for row in some)} kB" for some in zip(*pairs.values())
+    )
     return (
         f"Taught by the gate's lesson, a grid takes {octrees} as an octree, a gate {ours}, and the "
-        f"grid keeps {min(times):.1f} to {max(times):.1f} times the gate's volume, where both lose "
+        f"grid keeps {span(times)} times the gate's volume, where both lose "
         f"0.1% on held-out pixels of training photographs. By size and volume the grid pays more "
         f"for: {', '.join(grids) or 'none'}; the gate for: {', '.join(gates) or 'none'}. No host "
         "fills its own grid by that lesson."

@@ -60,9 +60,13 @@ def choose(rows: Sequence[Row]) -> Row:
 
     def worth(row: Row) -> tuple[bool, float, int]:
         size = stored_bytes(row)
-        return row["kept_volume"] >= 1.0, row["kept_volume"] * size**power, size
+        return _keeps_all(row), row["kept_volume"] * size**power, size
 
     return min(rows, key=worth)
+
+
+def _keeps_all(row: Row) -> bool:
+    return bool(row["kept_volume"] >= 1.0)
 
 
 def best_gate(rows: Sequence[Row]) -> Row | None:
@@ -93,8 +97,7 @@ def title_of(rows: Sequence[Row]) -> str:
     """What the scene needs, in ten words at most."""
     chosen = choose(rows)
     if grid := chosen if chosen["family"] == "grid" else grid_that_suffices(rows):
-        octree = " as an octree" if "octree_bytes" in grid else ""
-        return f"A grid suffices: {grid['size']}³ cells, {kilobytes(grid)}{octree}"
+        return f"A grid suffices: {_of_cells(grid).replace('^3', '³')}"
     may = "; perhaps a grid" if grid_that_nearly_suffices(rows) else ""
     return f"A gate of {kilobytes(chosen)} suffices{may}"
 
@@ -146,7 +149,8 @@ def kilobytes(row: Row) -> str:
 
 def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
     """Draws two panels over the bytes: volume kept at equal loss, loss at equal volume."""
-    rows = [row for row in results["representations"] if row["kept_volume"] < 1.0]
+    rows = [row for row in results["representations"] if not _keeps_all(row)]
+    rows = rows or results["representations"]
     volume = common_volume(rows)
     kept = [100.0 * row["kept_volume"] for row in rows]
     lost = [max(row["lost_at_volumes"][volume], LEAST) for row in rows]
@@ -204,7 +208,7 @@ def _draw_panel(panel: Any, rows: Sequence[Row], values: list[float], theme: The
 def circumstances(results: Mapping[str, Any]) -> str:
     """What was measured, in a line or two."""
     machine, scene = results["machine"], results["scene"]
-    full = [row["size"] for row in results["representations"] if row["kept_volume"] >= 1.0]
+    full = [row["size"] for row in results["representations"] if _keeps_all(row)]
     left_out = f" (not drawn, as they keep all: {', '.join(full)})" if full else ""
     where = f"{machine['cores']} CPU cores" if machine["device"] == "cpu" else machine["device"]
     return (

@@ -136,7 +136,7 @@ class Chart:
         code = run.pop("code", None) or describe_code()
         self.folder.store(job, run, made={**self._made(), **code})
         learns = job.contender.sampler.startswith(LEARNED)
-        late = learns and "freeze_seconds" in run and run["freeze_seconds"] is None
+        late = learns and run["freeze_seconds"] is None
         return (
             f"{title}: {run['psnr']:.2f} dB after {run['train_seconds']:.0f} s, "
             f"{run['render_seconds_per_image']:.2f} s an image" + (NOTHING_SKIPPED if late else "")

@@ -18,6 +18,7 @@ from leco_plugin.chart.summary import (
     LEARNING,
     LOST_SURFACE_MASS,
     Line,
+    at_equal_loss,
     best_so_far,
     circumstances,
 )
@@ -65,8 +66,7 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
         figure.text(0.015, below, "\n".join(said), va="top", fontsize=11.5)
         below -= SMALL_LINE_HEIGHT * (len(said) - 1)
         if shown.space:
-            stored = AS_OCTREES if "octree_bytes" in str(results["runs"]) else IN_BITS
-            _draw_occupancies(figure, below, shown, theme, SIZE + stored)
+            _draw_occupancies(figure, below, shown, theme)
         else:
             _draw_race(figure, below - 0.08 - 0.43, shown, theme)
         return save_picture(figure, path, results, dpi=160)
@@ -96,9 +96,11 @@ def _draw_race(figure: Any, height: float, shown: Shown, theme: Theme) -> None:
     panels[0].set_ylabel("PSNR, dB")
 
 
-def _draw_occupancies(figure: Any, top: float, shown: Shown, theme: Theme, size: str) -> None:
+def _draw_occupancies(figure: Any, top: float, shown: Shown, theme: Theme) -> None:
     """Space kept at equal loss above; curves and costs, small, below."""
     lines, (first, *others) = shown.lines, shown.space
+    grids = [row for one in at_equal_loss(lines) for row in one["grids"]]
+    held = AS_OCTREES if any("octree_bytes" in row for row in grids) else IN_BITS
     figure.text(0.015, 0.335, PSNR_BELOW, va="top", fontsize=11.5)
     by_psnr = first.more_x
     better = ", against PSNR. Up and right is better:" if by_psnr else ". Up and left is better:"
@@ -111,7 +113,7 @@ def _draw_occupancies(figure: Any, top: float, shown: Shown, theme: Theme, size:
     low = 0.455 if by_psnr else 0.43
     above = [figure.add_axes((x, low, wide, top - 0.11 - low)) for x, wide in places]
     above[0].set_ylabel("space kept, %")
-    draw_panel(above[0], replace(first, title="" if by_psnr else size), theme)
+    draw_panel(above[0], replace(first, title="" if by_psnr else SIZE + held), theme)
     if first.points:
         points = [(one.x, one.y) for one in first.points]
         names = [one.name.replace("taught grid", "taught") for one in first.points]

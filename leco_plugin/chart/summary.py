@@ -126,6 +126,12 @@ def middle_of(
     return middle(known) if len(known) == len(values) else None
 
 
+def at_equal_loss(lines: Sequence[Line]) -> list[Mapping[str, Any]]:
+    """What was measured at equal loss, of each run that has it."""
+    held = [run.get("occupancy") or {} for line in lines for run in line.runs]
+    return [found for one in held if (found := one.get("at_equal_loss"))]
+
+
 RENDERING = Cost("render_seconds_per_image", "rendering an image", "s")
 MEMORY = Cost("peak_memory_bytes", "peak memory", "GB", 1e-9)
 QUERIES = Cost("field_queries_per_ray", "field queries a ray", "")

@@ -22,6 +22,7 @@ from leco_plugin.chart.summary import (
     Cost,
     Line,
     Versus,
+    at_equal_loss,
     circumstances,
     common_psnr,
     lines_of,
@@ -251,20 +252,10 @@ def left_out(lines: Sequence[Line]) -> list[str]:
     said = []
     if names := never_held_of(lines):
         said.append(f"Left out, for not frozen with every seed: {', '.join(names)}.")
-    sizes = {
-        size
-        for line in lines
-        for run in line.runs
-        for size in ((run.get("occupancy") or {}).get("at_equal_loss") or {}).get("left_out", [])
-    }
-    full = {
-        row["name"]
-        for line in lines
-        for run in line.runs
-        for row in ((run.get("occupancy") or {}).get("at_equal_loss") or {}).get("others", ())
-        if keeps_all(row)
-    }
-    if full:
+    measured = at_equal_loss(lines)
+    sizes = {size for one in measured for size in one.get("left_out", ())}
+    others = [row for one in measured for row in one.get("others", ())]
+    if full := {row["name"] for row in others if keeps_all(row)}:
         said.append(f"Left out, for keeping all space in some run: {', '.join(sorted(full))}.")
     if sizes:
         listed = ", ".join(f"{size}³" for size in sorted(sizes))

@@ -190,9 +190,11 @@ def describe_scene(data: Path) -> dict[str, Any]:
 
 def megapixels_of(data: Path) -> float | None:
     """Million pixels of a scene's first photograph; None where its file does not say them."""
-    meta = check_scene(data)
-    width, height = (meta["frames"][0].get(side, meta.get(side)) for side in "wh")
-    return None if width is None or height is None else float(width) * float(height) / 1e6
+    scene = scene_file_of(LecoPhotographsDataParserConfig(data=data), "train")
+    lens = None if scene is None else scene.lenses[0]
+    if lens is None or lens.width is None or lens.height is None:
+        return None
+    return lens.width * lens.height / 1e6
 
 
 Array = NDArray[np.float64]
