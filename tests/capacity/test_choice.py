@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,6 +12,7 @@ from leco_plugin.capacity.choice import (
     best_gate,
     choose,
     common_volume,
+    draw,
     grid_that_nearly_suffices,
     grid_that_suffices,
     kilobytes,
@@ -97,3 +99,14 @@ def test_grids_that_never_keep_as_little_are_named() -> None:
 def test_losses_are_compared_at_about_the_volume_of_the_chosen_one() -> None:
     assert VOLUMES[common_volume([SMALL_GATE, COARSE])] == pytest.approx(0.062, rel=0.2)
     assert kilobytes(FINE) == "2.1 MB"
+
+
+def test_a_scene_where_everything_keeps_all_is_drawn(tmp_path: Path) -> None:
+    full = [one | {"kept_volume": 1.0} for one in (SMALL_GATE, COARSE | {"octree_bytes": 0})]
+    results = {
+        "representations": full,
+        "machine": {"cores": 2, "device": "cpu"},
+        "scene": {"name": "fog", "train_images": 9},
+        **{"learn_steps": 200, "rays": 8192, "lost_surface_mass": 1e-3},
+    }
+    assert draw(results, tmp_path / "capacity.png").stat().st_size > 1000
