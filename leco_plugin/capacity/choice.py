@@ -96,10 +96,12 @@ def grid_that_nearly_suffices(rows: Sequence[Row]) -> Row | None:
 def title_of(rows: Sequence[Row]) -> str:
     """What the scene needs, in ten words at most."""
     chosen = choose(rows)
-    if grid := chosen if chosen["family"] == "grid" else grid_that_suffices(rows):
-        return f"A grid suffices: {_of_cells(grid).replace('^3', '³')}"
-    may = "; perhaps a grid" if grid_that_nearly_suffices(rows) else ""
-    return f"A gate of {kilobytes(chosen)} suffices{may}"
+    if chosen["family"] == "grid":
+        return f"A grid suffices: {_of_cells(chosen).replace('^3', '³')}"
+    also = "; perhaps a grid" if grid_that_nearly_suffices(rows) else ""
+    if grid := grid_that_suffices(rows):
+        also = f"; so does a grid of {grid['size']}³"
+    return f"A gate of {kilobytes(chosen)} suffices{also}"
 
 
 def verdict(rows: Sequence[Row]) -> str:
