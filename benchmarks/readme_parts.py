@@ -9,16 +9,19 @@ from typing import Any
 
 import checkout  # noqa: F401
 from page_parts import RESULTS, between, noted, table
+from walk import with_walk
 
 from leco_plugin.chart.summary import Line, compare, lines_of
 
-DEMO = "<!-- demo table: generated -->", "<!-- end of the demo table -->"
+DEMO = "<!-- demo: generated -->", "<!-- end of the demo -->"
 GAIN = "<!-- gain: generated -->", "<!-- end of the gain -->"
 GAIN_CHART = "caliterra-hosts"
 """Each host with its own sampling and with a learned occupancy, in benchmarks/results/charts."""
 GIFTS_CHART = "caliterra-gifts"
 """A host with a learned occupancy, with and without what else it gets, and with its own grid."""
 OURS = "leco-occupancy"
+FAILED = 5.0
+"""dB below the worst run with its own grid, from which on a run has failed."""
 CLEAR = ("ahead", "behind")
 STANDS = {
     "ahead": "ahead of",
@@ -31,25 +34,42 @@ STANDS = {
 
 def readme(text: str) -> str:
     """The README with its tables renewed."""
-    text = between(text, DEMO, demo_table(json.loads((RESULTS / "demo.json").read_text())))
+    text = between(text, DEMO, demo_sentence(json.loads((RESULTS / "demo.json").read_text())))
     gifts = json.loads((RESULTS / "charts" / f"{GIFTS_CHART}.json").read_text())
+    text = with_walk(text, ("lines",))
     return between(text, GAIN, gain(f" {without_gifts(gifts)}"))
 
 
 def gain(also: str = "") -> str:
     """What a learned occupancy gains, and what is to be known of that chart."""
     chart = json.loads((RESULTS / "charts" / f"{GAIN_CHART}.json").read_text())
-    said = gain_table(chart) + also
+    said = gain_table(chart, short=bool(also)) + also
     return "\n\n".join([said, *filter(None, [noted(RESULTS).get(GAIN_CHART)])])
 
 
 def without_gifts(results: Mapping[str, Any]) -> str:
     """What a learned row of the gain has without what else it gets beside its gate."""
-    _, without, own = map(_psnrs, lines_of(results))
+    _, without, own = lines_of(results)
+    failed = [psnr for psnr in without.psnrs if psnr < min(own.psnrs) - FAILED]
+    ended = " and ".join(f"{psnr:.1f}" for psnr in without.psnrs if psnr not in failed)
+    count = f"{len(failed)} of {len(without.psnrs)} runs failed; the others" if failed else "runs"
     return (
-        "Part of Instant-NGP's lead is how its run begins: with gate and bounds alone, runs end at "
-        f"{without} dB, with its own grid at {own} "
+        "Part of Instant-NGP's lead is how its run begins. With gate and bounds alone "
+        f"{count} ended at {ended} dB; with its own grid runs ended at {_psnrs(own)} "
         "([more](docs/results.md#what-is-gained-in-the-same-time))."
+    )
+
+
+def demo_sentence(report: dict[str, Any]) -> str:
+    """What `make demo` ends with, in short."""
+    ours, other = report["runs"]
+    facts, name = report["occupancy"], "render_seconds_per_image"
+    return (
+        f"`make demo` learns for {ours['freeze_seconds']:.0f} of {ours['train_seconds']:.0f} s and "
+        f"ends at {ours['psnr']:.1f} dB (one seed). A gate that is never frozen ends at "
+        f"{other['psnr']:.1f} dB and takes {other[name] / ours[name]:.1f} times as long to render. "
+        f"Against the exact city, {facts['kept_surface_recall']:.1%} of the visible surface is "
+        f"kept and {facts['free_space_skipped']:.1%} of free space skipped."
     )
 
 
@@ -80,8 +100,22 @@ def demo_table(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def gain_table(results: Mapping[str, Any]) -> str:
-    """Accuracy, rendering and queries of each contender, and `gains`."""
+def lead(lines: Sequence[Line], seconds: float) -> str:
+    """Three numbers: of Instant-NGP, with a learned occupancy and with its own grid."""
+    host = [line for line in lines if line.method == "leco-ngp"]
+    ours = next(line for line in host if line.learned)
+    own = next(line for line in host if "own grid" in line.name)
+    image, of_own = (_median(line, "render_seconds_per_image") for line in (ours, own))
+    return (
+        f"**Instant-NGP after {seconds:g} s** of one CPU core: {ours.psnr:.1f} dB with a learned "
+        f"occupancy, {own.psnr:.1f} with its own grid; an image in {image:.1f} s, not "
+        f"{of_own:.1f}; {_queries(ours)} queries a ray, not {_queries(own)}."
+    )
+
+
+def gain_table(results: Mapping[str, Any], short: bool = False) -> str:
+    """Accuracy, rendering and queries of each contender, and `gains`; `short` leads with three
+    numbers."""
     lines = lines_of(results)
     seconds, scene = results["protocol"]["seconds"], results["scene"]["name"]
     cores = max(1, results["machine"]["threads"] // results["protocol"].get("at_once", 1))
@@ -97,7 +131,8 @@ def gain_table(results: Mapping[str, Any]) -> str:
         ]
         for line in lines
     ]
-    said = "**In the same time,** with a learned occupancy, " + gains(lines)
+    said = f"{lead(lines, seconds)}\n\n" if short else ""
+    said += "**In the same time,** with a learned occupancy, " + gains(lines)
     words = (
         "A query asks a network about one point; *small* ones ask a proposal network or a gate. "
         "*LeCO* is the paper's model: several small networks, the *experts*. A *host* is a method "
@@ -142,8 +177,8 @@ def _beside(ours: Line, rival: Line, host: str) -> str:
     word = STANDS.get(found.word, "beside")
     by = f"{abs(found.difference) if found.word in CLEAR else found.difference:.1f}"
     margin = f"± {found.margin:.1f} dB" if found.margin is not None else f"dB, {found.by}"
-    speed = f"{times:.1f} times as fast" if times >= 1.0 else f"{1.0 / times:.1f} times as slowly"
-    return f"{word} *{name}* by {by} {margin} (renders {speed})"
+    faster, slower = f"{times:.1f} times as fast", f"in {1.0 / times:.1f} times the time"
+    return f"{word} *{name}* by {by} {margin} (renders {faster if times >= 1.0 else slower})"
 
 
 def _psnrs(line: Line) -> str:

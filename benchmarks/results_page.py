@@ -25,7 +25,7 @@ from page_parts import RESULTS, ROOT, machine_line, made_line, noted, picture, s
 from page_pictures import GROWTH, LEARNING, draw_pictures, is_stale, pictures
 from profile_page import profile_sections
 from readme_parts import GAIN_CHART, GIFTS_CHART, demo_table, gain, gains, gifts_sentence, readme
-from sharpening import sharpening_sections
+from sharpening import kept_by_grids, sharpening_sections
 from sizes_sections import scene_results, sizes_sections
 from sizes_tables import where_it_pays
 from stability_page import PAGE as STABILITY_PAGE
@@ -33,15 +33,24 @@ from stability_page import headline, sentence
 from stability_page import page as stability_page
 from upstream_page import PAGE as UPSTREAM_PAGE
 from upstream_page import page as upstream_page
+from walk import with_walk
 
+from leco_plugin.chart.learned import last_gain
 from leco_plugin.chart.summary import lines_of
 
 PAGE = ROOT / "docs" / "results.md"
 MEASUREMENTS_PAGE = ROOT / "docs" / "measurements.md"
 SUITES_PAGE = ROOT / "docs" / "suites.md"
 README = ROOT / "README.md"
+HALF_HOUR_CHART = "caliterra-half-hour"
 STRETCH_CHART = "caliterra-stretch"
 """As the chart of the gain, in benchmarks/results/charts, tested on a stretch of the flight."""
+
+WALKED = {
+    ROOT / "docs" / "tutorial.md": ("poses", "train", "export"),
+    ROOT / "docs" / "large-scenes.md": ("learned",),
+}
+"""Pages that quote what a walk printed, and its parts."""
 
 HEAD = """# Results
 
@@ -60,6 +69,8 @@ field.
 
 {stretch}
 
+{half_hour}
+
 {gifts}
 
 The demo's city is known exactly, which photographs never are:
@@ -72,7 +83,8 @@ scene by scene. In question 5 the host is Switch-NeRF, in the others it is the p
 MORE = """## Further
 
 - **Is a grid enough?**{star} {capacity} [Gates and grids at equal
-  loss](measurements.md#how-much-a-scene-needs-gates-and-grids-at-equal-loss).
+  loss](measurements.md#how-much-a-scene-needs-gates-and-grids-at-equal-loss). {grids}
+  ([figures](measurements.md#sharpened-occupancies)).
 - **Does it fail, and when?** {stability} The learned runs have 200 steps
   more, 2.1 times the rays, sparse points, and begin opaque; proposal networks fail by samples
   beside the surface, hardly by PSNR. [Stability](stability.md) shows each case.
@@ -254,12 +266,24 @@ def new_views() -> str:
     )
 
 
+def half_an_hour() -> str:
+    """What is left of the gain when there is time."""
+    lines, anchor = lines_of(stored(HALF_HOUR_CHART)), heading_anchor(titles()[HALF_HOUR_CHART])
+    ends = [f"{line.name} has {line.psnr:.1f} dB ({last_gain(line):+.1f})" for line in lines]
+    return (
+        f"**After half an hour** of one core ([figures](measurements.md#{anchor}), one seed, so no "
+        f"verdict; gained in the last third in brackets), {', '.join(ends)}."
+    )
+
+
 def page() -> str:
     """The whole of `docs/results.md`."""
     demo = json.loads((RESULTS / "demo.json").read_text())
     anchor = heading_anchor(titles()[GAIN_CHART])
     gifts = gifts_sentence(stored(GIFTS_CHART), heading_anchor(titles()[GIFTS_CHART]))
-    note = GAIN_NOTE.format(anchor=anchor, gifts=gifts, stretch=new_views())
+    note = GAIN_NOTE.format(
+        anchor=anchor, gifts=gifts, stretch=new_views(), half_hour=half_an_hour()
+    )
     parts = [HEAD, f"{gain()}\n", f"{picture(GAIN_CHART)}\n", note]
     parts += [
         f"{demo_table(demo)}\n",
@@ -272,6 +296,7 @@ def page() -> str:
     found = {
         "star": " (*)" if "capacity" in noted(RESULTS) else "",
         "capacity": where_it_pays(scene_results("capacity")),
+        "grids": kept_by_grids(json.loads((RESULTS / "sharpening.json").read_text())),
         "stability": sentence(headline(stability)),
     }
     return "\n".join([*parts, MORE.format(**found)])
@@ -338,6 +363,8 @@ def main() -> int:
     wanted[MEASUREMENTS_PAGE] = measurements_page()
     wanted[STABILITY_PAGE] = stability_page(STABILITY_PAGE.read_text(), RESULTS)
     wanted[UPSTREAM_PAGE] = upstream_page(UPSTREAM_PAGE.read_text())
+    for page_of_walk, names in WALKED.items():
+        wanted[page_of_walk] = with_walk(page_of_walk.read_text(), names)
     if "--check" in sys.argv[1:]:
         stale = [path.name for path, text in wanted.items() if path.read_text() != text]
         stale += [path.name for path, results in pictures().items() if is_stale(path, results)]

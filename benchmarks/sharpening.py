@@ -4,12 +4,13 @@ Of runs of `leco-occupancy` that were not sharpened (`--pipeline.model.sharpenin
 gates are taught with three seeds, each on other training rays. By the field at the end, at the
 calibrated thresholds: candidates skipped, and what that loses on held-out pixels and on rays of
 test photographs, which nothing was calibrated on. By the field at freezing, which also knows what
-is skipped later: volume kept at equal loss, beside grids that the same lesson teaches. Stored in
-`results/sharpening.json`.
+is skipped later: volume kept at equal loss. Grids that the same lesson teaches stand beside both,
+calibrated by the same rule. Stored in `results/sharpening.json`.
 """
 
 from __future__ import annotations
 
+import statistics
 import time
 from collections.abc import Callable
 from functools import partial
@@ -19,8 +20,9 @@ from typing import Any
 import checkout  # noqa: F401
 import torch
 from measured_runs import main
-from page_parts import machine_line, made_line, size, table
+from page_parts import machine_line, made_line, size, span, table
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from leco_plugin.capacity.evidence import Evidence, gather
 from leco_plugin.capacity.measuring import taught_grid
@@ -36,30 +38,32 @@ from leco_plugin.chart.table import spread
 from leco_plugin.cli_occupancy import occupancy_of
 from leco_plugin.evaluation.equal_loss import kept_shares, mapped_box, reached_volume
 from leco_plugin.evaluation.field_grids import dilate, look_up_scores
-from leco_plugin.evaluation.inspection import in_parts
-from leco_plugin.learning.calibration import Measured, measure
-from leco_plugin.learning.dense import dense_rendering, in_chunks
+from leco_plugin.evaluation.inspection import ViewBox, in_parts
+from leco_plugin.learning.calibration import Measured, calibrate, measure
+from leco_plugin.learning.dense import DenseRendering, dense_rendering, in_chunks
 from leco_plugin.learning.sharpening import (
     Lesson,
     SharpeningConfig,
-    asked_by,
     lesson_by,
     seen_reference,
     sharpen,
     teach,
 )
-from leco_plugin.models.gate import Gate
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.mixture import Mixture
-from leco_plugin.models.rendering import Rays
+from leco_plugin.models.rendering import Rays, mapped_middles
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.learning_data import on_black
 
 SEEDS = 3
 GRIDS = (32, 64, 96, 128, 256)
+KINDS = ("", ", dilated", ", dilated and interpolated")
+"""What is made of each grid; whatever keeps least counts."""
 LOST = 1e-3
 """Share of the surface mass at which volumes are compared."""
 RAYS, PLACES = 8192, 1 << 17
+Score = Callable[[Tensor], Tensor]
+"""Of mapped positions [N, 3]: [N]."""
 SHOWN = ("threshold", "empty_fraction", "lost_surface_mass", "image_price_db")
 
 
@@ -68,22 +72,28 @@ def shown(measured: Measured) -> dict[str, float]:
     return {name: round(float(getattr(measured, name)), 6) for name in SHOWN}
 
 
-def on_rays(mixture: Mixture, gate: Gate, threshold: float, seen: Seen) -> Measured:
-    """What a gate skips and loses along some rays, of what is rendered as prices are."""
+def asked(mixture: Mixture, score: Score, seen: Seen) -> DenseRendering:
+    """Some rays as prices are measured on them, with what a gate or a grid says of candidates."""
     rendering = dense_rendering(mixture, seen.rays, on_black(seen.truth), 1024, seen_reference)
-    asked = asked_by(mixture, gate, in_chunks(seen.rays, 1024), rendering)
-    return measure(*asked, threshold)
+    pairs = zip(in_chunks(seen.rays, 1024), rendering.references, strict=True)
+    said = [
+        one._replace(occupancies=score(mapped_middles(mixture.region.space, rays, one.intervals)))
+        for rays, one in pairs
+    ]
+    return rendering._replace(references=said)
 
 
 def taught_by(source: Source, mixture: Mixture) -> dict[str, Any]:
-    """Small gates of three seeds by a field that was trained guided, beside what guided it."""
+    """Small gates of three seeds by a field that was trained guided, beside what guided it and
+    beside grids of the same lessons."""
     model = source.model
     assert model is not None
     occupancy = mixture.occupancy().eval()
     held_out = draw_held_out(source, occupancy, RAYS, parts=1)[0]
     tests = draw_test_rays(source, occupancy, RAYS)
     assert tests is not None
-    rows = []
+    losses, calibration = model.config.gate_loss, model.config.calibration
+    rows, grids = [], []
     for seed in range(SEEDS):
         taught = rays_that_teach(source, occupancy, seed)
         started = time.process_time()
@@ -92,19 +102,29 @@ def taught_by(source: Source, mixture: Mixture) -> dict[str, Any]:
             taught,
             (held_out.rays, on_black(held_out.truth)),
             [],  # no photograph vouches: test rays say what a new view loses
-            model.config.gate_loss,
-            model.config.calibration,
+            losses,
+            calibration,
             SharpeningConfig(),
         )
         assert found is not None
         seconds = time.process_time() - started
-        after = on_rays(mixture, found.gate, found.measured.threshold, tests)
+        small = partial(mixture.occupancies, gate=found.gate)
+        after = measure(*asked(mixture, small, tests), found.measured.threshold)
         rows.append(
             {"seconds": round(seconds, 1), "held_out": shown(found.measured), "test": shown(after)}
         )
         print(f"  seed {seed}: {rows[-1]}", flush=True)
-    before = on_rays(mixture, mixture.gate, float(mixture.threshold), tests)
-    return {"before": {"held_out": shown(found.before), "test": shown(before)}, "small": rows}
+        lesson = lesson_by(mixture, taught, losses, 1.0, 1024)
+        of_seed = {}
+        for name, score in grid_scores(mixture, lesson).items():
+            measured = calibrate(*asked(mixture, score, held_out), calibration)
+            after = measure(*asked(mixture, score, tests), measured.threshold)
+            of_seed[name] = {"held_out": shown(measured), "test": shown(after)}
+        grids.append(of_seed)
+    routing = partial(mixture.occupancies, gate=mixture.gate)
+    before = measure(*asked(mixture, routing, tests), float(mixture.threshold))
+    first = {"held_out": shown(found.before), "test": shown(before)}
+    return {"before": first, "small": rows, "grids": grids}
 
 
 def rays_that_teach(source: Source, occupancy: Occupancy, seed: int) -> Rays:
@@ -113,14 +133,28 @@ def rays_that_teach(source: Source, occupancy: Occupancy, seed: int) -> Rays:
     return draw_training_rays(source, occupancy, SharpeningConfig().rays).rays
 
 
-def grid_score(
-    mixture: Mixture, lesson: Lesson, cells: int, dilated: bool
-) -> Callable[[Tensor], Tensor]:
-    """What `leco capacity` makes of a grid: as it is, or dilated by a cell."""
+def grid_scores(mixture: Mixture, lesson: Lesson) -> dict[str, Score]:
+    """Grids of one lesson, by name, each as it is and as `KINDS` has it."""
+    found: dict[str, Score] = {}
     box = mapped_box(mixture)
-    filled = taught_grid(lesson, box, cells)
-    filled = dilate(filled) if dilated else filled
-    return lambda mapped: look_up_scores(filled, box, mapped)
+    for n in GRIDS:
+        filled = taught_grid(lesson, box, n)
+        wide = dilate(filled)
+        made = (
+            partial(look_up_scores, filled, box),
+            partial(look_up_scores, wide, box),
+            partial(interpolated, wide, box),
+        )
+        found |= {f"grid {n}^3{kind}": score for kind, score in zip(KINDS, made, strict=True)}
+    return found
+
+
+def interpolated(scores: Tensor, box: ViewBox, mapped: Tensor) -> Tensor:
+    """Scores [nx, ny, nz] between the middles of cells: of mapped positions [N, 3], [N]."""
+    places = ((mapped - box.low) / (box.high - box.low) * 2.0 - 1.0).flip(-1)[None, None, None]
+    return grid_sample(scores[None, None], places, align_corners=False, padding_mode="border").view(
+        -1
+    )
 
 
 def at_equal_loss(source: Source, mixture: Mixture) -> list[dict[str, Any]]:
@@ -148,10 +182,9 @@ def at_equal_loss(source: Source, mixture: Mixture) -> list[dict[str, Any]]:
         gate = teach(config.gate, heard, config.steps, mixture.precision)
         size = 2 * sum(p.numel() for p in gate.parameters())
         rivals[f"small gate, seed {seed}"] = (size, partial(mixture.occupancies, gate=gate))
-    for n in GRIDS:
-        for dilated in (False, True):
-            name = f"grid {n}^3{', dilated' if dilated else ''}"
-            rivals[name] = (-(-(n**3) // 8), grid_score(mixture, lesson, n, dilated))
+    for name, score in grid_scores(mixture, lesson).items():
+        cells = int(name.split("^")[0].removeprefix("grid "))
+        rivals[name] = (-(-(cells**3) // 8), score)
     rows = []
     for name, (size, score) in rivals.items():
         of_volume, row = in_parts(score, places), {"name": name, "bytes": size}
@@ -184,7 +217,8 @@ def sharpening_sections(report: dict[str, Any]) -> list[str]:
     """The stored figures as a part of `docs/results.md`."""
     scenes = report["scenes"].items()
     guided = table(
-        "scene | skipped by the learned gate | by small gates | surface lost on test rays | s",
+        "scene | skipped by the learned gate | by small gates | surface lost on test rays | s"
+        " | by the best grid, taught alike | surface lost on test rays",
         [_guided_row(scene, found["at_end"]) for scene, found in scenes],
     )
     equal = table(
@@ -198,24 +232,59 @@ def sharpening_sections(report: dict[str, Any]) -> list[str]:
         f"{machine_line(report)}. Rows {made_line(report['scenes'].values())}.\n",
         "The field at the end teaches small gates, each of three on other training rays. Shares "
         "are of candidates on held-out rays, at the calibrated thresholds; losses are of what the "
-        "learned gate keeps. Seconds of one core are for teaching and calibrating.\n",
+        "learned gate keeps. Seconds of one core are for teaching and calibrating. Grids of 32³ to "
+        "256³ cells have the same lessons and the same rule, as they are, dilated by a cell, or "
+        "interpolated between cells too; the one that skips most counts.\n",
         *guided,
         f"\nAt {LOST:g} of the surface lost *on test rays*, by the field at freezing: volume kept "
-        "of what rays reach; candidates kept on those rays; bytes. Grids are as they are or "
-        "dilated, whichever keeps less.\n",
+        "of what rays reach; candidates kept on those rays; bytes. Of the same grids the one that "
+        "keeps least.\n",
         *equal,
         "",
     ]
 
 
+def best_grid(found: dict[str, Any]) -> tuple[str, list[dict[str, Any]]]:
+    """Of the grids at the end of a run the one that skips most, in the median of its lessons."""
+    of_seeds = found["grids"]
+    return max(
+        ((name, [one[name] for one in of_seeds]) for name in of_seeds[0]),
+        key=lambda named: statistics.median(skipped_by(named[1])),
+    )
+
+
+def skipped_by(rows: list[dict[str, Any]]) -> list[float]:
+    """Shares of candidates on held-out rays."""
+    return [row["held_out"]["empty_fraction"] for row in rows]
+
+
+def kept_by_grids(report: dict[str, Any]) -> str:
+    """How many candidates the best grid keeps at the end of a run, beside small gates: for
+    `docs/results.md`."""
+    times = []
+    for found in report["scenes"].values():
+        grid, small = (
+            1.0 - statistics.median(skipped_by(rows))
+            for rows in (best_grid(found["at_end"])[1], found["at_end"]["small"])
+        )
+        times.append(grid / small)
+    return (
+        f"At the end of a run, by the run's own rule, the best of such grids keeps {span(times)} "
+        f"times as many candidates as the small gate, on {len(times)} scenes"
+    )
+
+
 def _guided_row(scene: str, found: dict[str, Any]) -> list[str]:
     small = found["small"]
+    name, grids = best_grid(found)
     return [
         scene,
         f"{found['before']['held_out']['empty_fraction']:.1%}",
-        spread([row["held_out"]["empty_fraction"] for row in small], ".1%"),
+        spread(skipped_by(small), ".1%"),
         spread([row["test"]["lost_surface_mass"] for row in small], ".1e"),
         spread([row["seconds"] for row in small], ".0f"),
+        f"{spread(skipped_by(grids), '.1%')} ({name[5:]})",
+        spread([row["test"]["lost_surface_mass"] for row in grids], ".1e"),
     ]
 
 

@@ -110,7 +110,7 @@ def test_it_is_said_for_every_scene_whether_ours_is_on_the_fronts(store: Store) 
     link = "#suite-representations-on-city"
     kept = "| 12.5%, 50 kB | 30.0%, 33 kB | 10.0%, 4.0 MB |"
     assert f"| [city]({link}) {kept} MLP (ours): nothing as small or learned" in text
-    assert "nothing as small keeps less space; learned as soon, hash grid keeps less" in text
+    assert "nothing as small keeps less space; learned as soon, less is kept by hash grid" in text
 
 
 def test_a_grid_that_is_smaller_and_keeps_less_is_named(store: Store) -> None:
@@ -118,7 +118,7 @@ def test_a_grid_that_is_smaller_and_keeps_less_is_named(store: Store) -> None:
     text = answered()
     assert (
         "on 0 of 1 scene nothing as small keeps less space," in text
-        and "as small, grid 64³ keeps less (one seed: no verdict) |" in text
+        and "as small, less is kept by grid 64³ (one seed: no verdict) |" in text
     )
 
 
@@ -126,7 +126,7 @@ def test_one_that_keeps_less_in_the_median_only_is_said_to_be_undecided(store: S
     store("representations", "city", *representations(10.0, grid_kept=(0.05, 0.05, 0.3)), **STEPS)
     text = answered()
     assert "on 0 of 1 scene nothing as small keeps less space, on 1 nothing that is" in text
-    assert "as small, grid 64³ (undecided in space) keeps less (3 seeds) |" in text
+    assert "as small, less is kept by grid 64³ (undecided in space) (3 seeds) |" in text
 
 
 def test_minutes_are_those_of_runs_two_at_a_time_and_shared_ones_count_once(store: Store) -> None:
@@ -259,8 +259,9 @@ def test_the_readme_says_that_its_chart_was_made_before_a_mend(
 
 
 def test_what_is_around_the_tables_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parts, "demo_table", lambda report: "demo")
-    monkeypatch.setattr(parts, "gain_table", lambda chart: "gain")
+    monkeypatch.setattr(parts, "demo_sentence", lambda report: "demo")
+    monkeypatch.setattr(parts, "with_walk", lambda text, names: text)
+    monkeypatch.setattr(parts, "gain_table", lambda chart, short: "gain")
     monkeypatch.setattr(parts, "without_gifts", lambda chart: "alone")
     (before, after), (begin, end) = parts.DEMO, parts.GAIN
     text = f"A\n{before}\nstale\n{after}\nB\n{begin}\n{end}\nC\n"

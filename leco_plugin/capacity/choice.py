@@ -100,7 +100,7 @@ def title_of(rows: Sequence[Row]) -> str:
         return f"A grid suffices: {_of_cells(chosen).replace('^3', '³')}"
     also = "; perhaps a grid" if grid_that_nearly_suffices(rows) else ""
     if grid := grid_that_suffices(rows):
-        also = f"; so does a grid of {grid['size']}³"
+        also = f", or {grid['size']}³ cells"
     return f"A gate of {kilobytes(chosen)} suffices{also}"
 
 

@@ -186,7 +186,9 @@ def shortest_verdict(representations: Sequence[Representation]) -> str:
             return f"{one.name} is the smallest occupancy: {one.median('size'):.0f} kB"
     for one in ours:
         if fronts := fronts_of(one, representations):
-            return f"{one.name} is unbeaten in {' and in '.join(fronts)}"
+            return (
+                f"no occupancy {' or '.join(AS_CHEAP[name] for name in fronts)} as ours keeps less"
+            )
     leader = _best_ahead(ours[0], representations, "size")
     return f"{ours[0].name} keeps more space than {leader}"
 
@@ -205,7 +207,7 @@ def _standing_of(one: Representation, all_of_them: Sequence[Representation]) -> 
     free = " or ".join(AS_CHEAP[name] for name in fronts)
     parts = [f"nothing {free} keeps less space"] if free else []
     parts += [
-        f"{AS_CHEAP[name]}, {_best_ahead(one, all_of_them, figure)} keeps less"
+        f"{AS_CHEAP[name]}, less is kept by {_best_ahead(one, all_of_them, figure)}"
         for name, figure in COSTS.items()
         if name not in fronts
     ]

@@ -273,7 +273,9 @@ def headline(results: Mapping[str, Any], short: bool = False) -> str:
         if not short:
             return said
         level = f"{best.name} is level with the next best"
-        return level if found.word == "level" else f"{best.name} or the next best: undecided"
+        if found.word == "level":
+            return level
+        return f"undecided: {best.psnr:.1f} dB for {best.name}, {second.psnr:.1f} next"
     if short:
         return f"{best.name} is ahead by {apart} dB"
     said = f"{best.name} is ahead: {best.psnr:.1f} dB, {apart} more than {second.name} ({found.by})"

@@ -168,7 +168,7 @@ class LearningData:
         if sparse_points(dataset) is None:
             found.append(
                 "this scene has no sparse points, so that its bounds are guessed from its cameras; "
-                "`leco points SCENE` finds some (pip install 'leco-plugin[poses]')"
+                "`leco points SCENE` finds some (it needs pycolmap)"
             )
         return found
 

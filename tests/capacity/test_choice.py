@@ -80,7 +80,7 @@ def test_a_usual_grid_that_keeps_as_little_as_a_smaller_gate_suffices() -> None:
     assert choose(rows) is SMALL_GATE and grid_that_suffices(rows) is usual
     said = verdict(rows)
     assert said.startswith("A grid suffices: 128^3 cells, 262.1 kB.") and "With 3.0 kB" in said
-    assert title_of(rows) == "A gate of 3.0 kB suffices; so does a grid of 128³"
+    assert title_of(rows) == "A gate of 3.0 kB suffices, or 128³ cells"
 
 
 def test_a_grid_that_keeps_hardly_more_is_not_called_worse() -> None:

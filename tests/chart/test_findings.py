@@ -88,7 +88,7 @@ def test_the_headline_names_the_leader_and_its_lead_beyond_the_spread_of_seeds()
     assert headline(results(*noisy, *best)) == (
         "b and a are undecided: 21.5 and 20.0 dB, 1.50 ± 4.95 apart (3 seeds)"
     )
-    assert headline(results(*noisy, *best), short=True) == "b or the next best: undecided"
+    assert headline(results(*noisy, *best), short=True) == "undecided: 21.5 dB for b, 20.0 next"
     assert headline(results(*other[:1], *best)) == "b 21.5 dB, a 20.0 dB (one seed: no verdict)"
 
 

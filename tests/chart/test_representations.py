@@ -79,11 +79,12 @@ def test_what_leads_in_the_median_but_not_beyond_the_spread_of_seeds_is_level() 
         other = held("planes", (8.0, usual), (8.0, usual), (8.0, most))
         assert fronts_of(ours, [ours, other]) == []
         assert verdict([ours, other]) == (
-            f"ours: as small, planes ({word}) keeps less; learned as soon, planes ({word} in "
-            "space) keeps less (3 seeds)"
+            f"ours: as small, less is kept by planes ({word}); learned as soon, less is kept by "
+            f"planes ({word} in space) (3 seeds)"
         )
     larger = Representation("larger", {i: Held(60.0, 8.0, 9.5) for i in range(3)})
-    said = "ours: nothing as small keeps less space; learned as soon, larger keeps less (3 seeds)"
+    said = "ours: nothing as small keeps less space; learned as soon, less is kept by larger"
+    said += " (3 seeds)"
     assert verdict([ours, larger]) == said
     slower = held("slower", (8.5, 12.0), (12.0, 12.0), (12.0, 12.0))
     assert verdict([ours, slower]) == "ours keeps least space, 10.0% in 50 kB (3 seeds)"
@@ -123,8 +124,8 @@ def test_grids_of_the_same_lesson_and_sparse_points_stand_beside() -> None:
     assert left in table(results(ours))
     assert not any(one.ours for name, one in held.items() if name != "MLP (ours)")
     assert verdict([*held.values()]) == (
-        "MLP (ours): nothing learned as soon keeps less space; as small, taught grid 64³ keeps "
-        "less (one seed: no verdict)"
+        "MLP (ours): nothing learned as soon keeps less space; as small, less is kept by taught "
+        "grid 64³ (one seed: no verdict)"
     )
 
 
@@ -145,8 +146,8 @@ def test_small_gates_that_the_field_has_taught_stand_beside_those_of_their_kind(
     assert small.is_small_of(large) and hashed.is_small_of(rival_gate)
     assert not small.is_small_of(rival_gate) and not large.is_small_of(large)
     assert verdict(held) == (
-        "small MLP (ours) keeps least space, 10.0% in 5 kB. MLP (ours): as small, small MLP (ours) "
-        "keeps less; learned as soon, hash grid keeps less (one seed: no verdict)"
+        "small MLP (ours) keeps least space, 10.0% in 5 kB. MLP (ours): as small, less is kept "
+        "by small MLP (ours); learned as soon, less is kept by hash grid (one seed: no verdict)"
     )
 
 
@@ -157,8 +158,8 @@ def test_what_is_ahead_of_the_gate_that_a_run_writes_is_said_whatever_a_small_on
     ours = run("MLP (ours)", occupancy=facts)
     said = verdict(representations_of(lines_of(results(ours, other))))
     assert said.startswith(
-        "small MLP (ours): nothing as small keeps less space; learned as soon, hash grid keeps "
-        "less. MLP (ours): as small, hash grid keeps less"
+        "small MLP (ours): nothing as small keeps less space; learned as soon, less is kept by "
+        "hash grid. MLP (ours): as small, less is kept by hash grid"
     )
 
 
@@ -221,11 +222,13 @@ GATES = {
     [
         (
             "faster ours",
-            "MLP (ours): nothing as small keeps less space; learned as soon, hash grid keeps less",
+            "MLP (ours): nothing as small keeps less space; learned as soon, less is kept by hash "
+            "grid",
         ),
         (
             "ours faster smaller",
-            "MLP (ours): as small, K-planes keeps less; learned as soon, hash grid keeps less",
+            "MLP (ours): as small, less is kept by K-planes; learned as soon, less is kept by hash "
+            "grid",
         ),
         ("faster smaller", "our own gate was not frozen with every seed"),
         ("wide less", "MLP (ours): nothing as small or learned as soon keeps less space"),

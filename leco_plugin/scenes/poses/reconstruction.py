@@ -39,7 +39,7 @@ MODELS = "colmap/models"
 """COLMAP's models, in the folder of the scene."""
 MASKS = "masks"
 """Folder of masks, named NAME.png for a photograph NAME; what is black in one has no features."""
-EXTRA = "pip install 'leco-plugin[poses]'"
+EXTRA = "pip install 'pycolmap>=4' pillow-heif"
 
 
 def load_pycolmap() -> Any:

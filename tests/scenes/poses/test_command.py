@@ -252,7 +252,7 @@ def test_without_pycolmap_one_line_says_how_to_install_it(
     monkeypatch.setitem(__import__("sys").modules, "pycolmap", None)
     assert cli.main(["poses", str(photos), "--out", str(tmp_path / "out")]) == 1
     said = capsys.readouterr().err
-    assert "pip install 'leco-plugin[poses]'" in said and said.count("\n") == 1
+    assert "pip install 'pycolmap>=4' pillow-heif" in said and said.count("\n") == 1
     assert not (tmp_path / "out").exists()
 
 
