@@ -111,7 +111,7 @@ def missing(given: dict[str, dict[str, str]], learned: Sequence[str]) -> list[st
         others = f"{WORDS.get(most, most)} for the others"
         without = [name for name in learned if given[name][gift] != given[learned[0]][gift]]
         beside = (
-            "a learned row without it can be charted" if without else "no learned row is without it"
+            "a learned row without it can be charted" if without else "all learned rows have it"
         )
         lines.append(f"- **{gift.capitalize()}**: {'; '.join([*parts, others])}; {beside}.")
     return [*(lines or ["- All rows have the same."]), ""]

@@ -23,8 +23,8 @@ HEAD = "Method | Trained for | Sampling | Memory | PSNR | Rendering an image"
 BELOW = r"""
 75 drone photographs of a building site (OpenDroneMap's `odm_data_caliterra`, 480 x 360), on one CPU
 core each. Memory is the most that the process held, a median. PSNR is of test photographs: the mean
-of {seeds} seeds, with the least and the most. A method marked (\*) has a chart that was made before
-a later change."""
+of {seeds} seeds, with the least and the most. Below each method stands what it is compared with."""
+OLD = r" A method marked (\*) has a chart that was made before a later change."
 
 
 def page(text: str) -> str:
@@ -35,11 +35,11 @@ def page(text: str) -> str:
         guided = next(line for line in lines if line.learned)
         other = next(line for line in lines if not line.learned)
         mark = r" (\*)" if name in notes() else ""
-        for line in (guided, other):
-            rows.append([f"`{method}`{mark}", *_cells(line)])
-            seeds.add(len(line.runs))
+        rows += [[f"`{method}`{mark}", *_cells(guided)], ["", *_cells(other)]]
+        seeds |= {len(guided.runs), len(other.runs)}
     count = " or ".join(str(some) for some in sorted(seeds))
-    return between(text, MARKS, "\n".join([*table(HEAD, rows), BELOW.format(seeds=count)]))
+    below = BELOW.format(seeds=count) + OLD * any(name in notes() for name in CHARTS.values())
+    return between(text, MARKS, "\n".join([*table(HEAD, rows), below]))
 
 
 def _cells(line: Line) -> list[str]:

@@ -96,8 +96,8 @@ def poses(
 ) -> None:
     """Find where photographs were taken, and write them as a scene to train on.
 
-    Runs COLMAP on the CPU, by pycolmap, which the extra `poses` installs. The scene is upright, and in
-    metres where EXIF has GPS. A killed run resumes when the same command is typed again.
+    Runs COLMAP on the CPU, by pycolmap, which the extra `poses` installs. The scene is upright,
+    and in metres where EXIF has GPS. A killed run resumes when the same command is typed again.
 
     Args:
         photos: Folder of the photographs, with those below it. They are only read.
@@ -125,9 +125,9 @@ def points(
 ) -> None:
     """Give a scene that has poses and no sparse points some, which say where its surfaces lie.
 
-    Runs COLMAP on the CPU, by pycolmap, which the extra `poses` installs, from the poses and lenses of the
-    scene, which stay as they are. Writes leco_points.ply into the scene and names it in
-    transforms.json. The file as it was stays beside it as transforms.before_points.json.
+    Runs COLMAP on the CPU, by pycolmap, which the extra `poses` installs, from the poses and
+    lenses of the scene, which stay as they are. Writes leco_points.ply into the scene and names it
+    in transforms.json. The file as it was stays beside it as transforms.before_points.json.
 
     Args:
         data: Scene in nerfstudio's format. Its photographs are only read; those for tests are not.

@@ -242,7 +242,7 @@ def test_a_contender_that_lacks_a_gift_is_named_on_the_page_of_gifts() -> None:
         assert not _lines_of(gift, [whole, replace(whole, name="Instant-NGP + rich")])
     rates = {"optimizers.fields.optimizer.lr": 0.5}
     (line,) = _lines_of("Rates", [whole, replace(grid, settings=rates)])
-    assert "0.5" in line and "no learned row is without it" in line
+    assert "0.5" in line and "all learned rows have it" in line
 
 
 def _lines_of(gift: str, rows: list[Contender]) -> list[str]:

@@ -159,7 +159,8 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
     with themed(theme):
         figure = new_figure((11, 5.9), theme.page)
         figure.text(0.015, 0.975, title_of(rows), va="top", fontsize=17, fontweight="bold")
-        said = "\n".join(textwrap.fill(one, 118) for one in (verdict(rows), circumstances(results)))
+        found = verdict(rows).replace("^3", "³")
+        said = "\n".join(textwrap.fill(one, 138) for one in (found, circumstances(results)))
         figure.text(0.015, 0.9, said, va="top", fontsize=11)
         panels = [figure.add_axes((0.065 + 0.485 * i, 0.2, 0.435, 0.5)) for i in range(2)]
         share = results["lost_surface_mass"]
@@ -201,7 +202,7 @@ def _draw_panel(panel: Any, rows: Sequence[Row], values: list[float], theme: The
     panel.set(yscale="log", xlabel="kB")
     log_axis(panel, "x", (1.0,))
     if min(values) > 2 * LEAST and max(values) > 1.0:
-        log_axis(panel, "y", (1.0, 2.0, 5.0))
+        log_axis(panel, "y", (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0))
     panel.tick_params(axis="y", which="minor", labelleft=False)
     panel.margins(x=0.1, y=0.16)
     plain(panel, theme)
@@ -217,7 +218,7 @@ def circumstances(results: Mapping[str, Any]) -> str:
         f"{scene['name']}, {scene['train_images']} photographs; one field of "
         f"{results['learn_steps']} steps teaches all; {results['rays']} held-out rays; {where}. "
         f"Gates in bfloat16, grids as octrees{left_out}; down and left is better. "
-        "Ten times the bytes of the chosen save less than a third."
+        "Chosen: what has ten times the bytes does not keep a third less."
     )
 
 
