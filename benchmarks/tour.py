@@ -40,7 +40,8 @@ MOST_SAMPLES = 64
 LIGHT = (0.35, 0.25, 0.9)
 """Where it comes from, east, north, up."""
 AMBIENT = 0.35
-PAPER, INK = (255, 255, 255), (40, 40, 40)
+PAPER, INK = (22, 27, 34), (230, 237, 243)
+"""Dark, as films are: for light pages and dark ones."""
 
 
 def flight(cameras: Cameras, first: int, photographs: int, width: int) -> tuple[Cameras, list[int]]:
@@ -160,7 +161,8 @@ def draw(run: Path, out: Path, first: int, photographs: int) -> None:
                 of_map("magma", (samples / MOST_SAMPLES).sqrt()),
             ]
             titles = ["photograph", "rendering", "what is kept"]
-            frames.append(framed(panels, [*titles, f"{float(samples.mean()):.0f} samples a ray"]))
+            count = f"{float(samples.mean()):.0f} of {model.mixture.sizes.candidates} samples a ray"
+            frames.append(framed(panels, [*titles, count]))
             show((number + 1) / len(nearest))
     write_film(frames + frames[-2:0:-1], out, FRAME, COLOURS)
 

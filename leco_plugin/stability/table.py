@@ -22,19 +22,22 @@ NOTHING = "nothing has been run yet"
 QUICKLY = "made with --quick, which shows that everything runs and no more"
 NO_VERDICT = "no verdict yet: nothing has been run beside a dense run that trains"
 SIGNS = {"pass": "pass", "degraded": "degraded", "fail": "**fail**", "no reference": "-"}
-ROW, HEAD, FOOT = 0.36, 1.0, 0.7
+ROW, HEAD, FOOT = 0.34, 1.15, 0.75
 """Heights in inches."""
-NAMES, COLUMN = 2.75, 2.0
-"""Widths in inches."""
+NAMES, COLUMN = 2.45, 1.88
+"""Widths in inches: type of 10 points is to be read where a page shows all of it."""
 GAP = 0.03
 VIEW = 3.4
 """Width of one picture of a failure, inches."""
 DRAWN_SIGNS = {"pass": "✓", "degraded": "~", "fail": "✗", "no reference": "-"}
 HOW_TO_READ = (
-    "Each cell: PSNR against the dense run of the same host; samples kept, surfaces lost.  "
+    "Each cell: PSNR against the dense run of the same host, and the surfaces that are lost, or "
+    "how far below the median the worst seed is.  "
     "✓ within 0.2 dB and no bad seed   ~ degraded   ✗ fails   "
     "- nothing to compare with: the dense run does not train"
 )
+LOST = 0.005
+"""Share of the surfaces that is said in a picture."""
 ON_LIGHT = {
     "pass": ("#d7f0df", "#0f5a2f"),
     "degraded": ("#fbeab8", "#6b4c00"),
@@ -99,11 +102,12 @@ def titles(results: Results) -> tuple[str, str]:
 def _count_passes(results: Results) -> str:
     cells = [cell for row in results["cases"] for cell in row["cells"].values()]
     compared = [one for one in results["samplers"] if one["reference"] is not None]
-    parts = []
+    parts: list[str] = []
     for one in sorted(compared, key=lambda one: one["name"] != LEARNED):
         held = [word for word in verdicts_of(results, one["name"]) if word != "no reference"]
         if held:
-            parts.append(f"{one['title']} passes {held.count('pass')} of {len(held)}")
+            word = "" if parts else " passes"
+            parts.append(f"{one['title']}{word} {held.count('pass')} of {len(held)}")
     if not parts:
         return NO_VERDICT if any(cell["seeds"] for cell in cells) else NOTHING
     parts[0] += " cases"
@@ -189,10 +193,11 @@ def draw(results: Results, path: Path, theme: Theme = LIGHT) -> Path:
     axes.text(0.15, 0.12, title, va="top", color=theme.ink, fontsize=14, fontweight="bold")
     low = 0.12 + 0.28 * (title.count("\n") + 1)
     axes.text(0.15, low, below, va="top", color=theme.ink, fontsize=11)
-    named = {"fontsize": 10.5, "color": theme.ink}
+    named = {"fontsize": 11.5, "color": theme.ink}
     for number, one in enumerate(samplers):
         middle = NAMES + COLUMN * (number + 0.5)
-        axes.text(middle, HEAD - 0.1, one["title"], ha="center", va="bottom", **named)
+        heading = one["title"].replace(" (", "\n(")
+        axes.text(middle, HEAD - 0.1, heading, ha="center", va="bottom", **named)
     for number, row in enumerate(cases):
         top = HEAD + ROW * number
         axes.text(0.15, top + ROW / 2, row["title"], va="center", **named)
@@ -201,8 +206,8 @@ def draw(results: Results, path: Path, theme: Theme = LIGHT) -> Path:
             if cell is not None:
                 colours = (ON_LIGHT if theme is LIGHT else ON_DARK)[cell["verdict"]]
                 _draw_cell(axes, cell, NAMES + COLUMN * column, top, *colours)
-    explained = textwrap.fill(HOW_TO_READ, int(width * 13))
-    axes.text(0.15, height - FOOT + 0.12, explained, va="top", fontsize=9, color=theme.ink)
+    explained = textwrap.fill(HOW_TO_READ, int(width * 11))
+    axes.text(0.15, height - FOOT + 0.12, explained, va="top", fontsize=10.5, color=theme.ink)
     return save_picture(figure, path, results, dpi=140)
 
 
@@ -214,16 +219,22 @@ def _draw_cell(
     corner, size = (left + GAP, top + GAP), (COLUMN - 2 * GAP, ROW - 2 * GAP)
     look: Any = {"boxstyle": "round,pad=0,rounding_size=0.04", "edgecolor": "none"}
     axes.add_patch(FancyBboxPatch(corner, *size, facecolor=ground, **look))
-    first, second, seeds = figures(cell)
-    middle = top + ROW / 2
-    upper = middle - (0.065 if second else 0.0)
-    for x, y, text, size_of_type, side in (
-        (left + 0.17, middle, DRAWN_SIGNS[cell["verdict"]], 12, "center"),
-        (left + 0.33, upper, first, 9.5, "left"),
-        (left + COLUMN - 0.08, upper, seeds, 7, "right"),
-        (left + 0.33, middle + 0.085, second, 7, "left"),
+    first, middle = figures(cell)[0], top + ROW / 2
+    for x, text, size_of_type, side in (
+        (left + 0.16, DRAWN_SIGNS[cell["verdict"]], 12, "center"),
+        (left + 0.3, first, 11, "left"),
+        (left + COLUMN - 0.08, _wrong(cell), 9.5, "right"),
     ):
-        axes.text(x, y, text, ha=side, va="center", fontsize=size_of_type, color=ink)
+        axes.text(x, middle, text, ha=side, va="center", fontsize=size_of_type, color=ink)
+
+
+def _wrong(cell: Mapping[str, Any]) -> str:
+    """What a cell that does not pass suffers from, in two words."""
+    if cell["psnr"] is None or cell["verdict"] in ("pass", "no reference"):
+        return ""
+    if cell["gap"] is not None and (cell["lost_mass"] or 0.0) >= LOST:
+        return f"lost {cell['lost_mass']:.0%}"
+    return f"worst {cell['worst']:+.1f}" if cell["seeds"] > 1 else ""
 
 
 def draw_side_by_side(pictures: Mapping[str, Path], title: str, path: Path) -> None:

@@ -59,7 +59,7 @@ TWO = results(
 
 def test_the_headline_counts_what_was_passed_where_there_is_a_reference() -> None:
     said = headline(TWO)
-    assert said == "learned occupancy passes 1 of 2 cases; grid 128³ passes 0 of 1"
+    assert said == "learned occupancy passes 1 of 2 cases; grid 128³ 0 of 1"
     assert verdicts_of(TWO, "learned") == ["pass", "degraded"]
     assert headline(results()) == "nothing has been run yet"
 
