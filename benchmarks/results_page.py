@@ -24,7 +24,16 @@ from learning import sentence as learning_sentence
 from page_parts import RESULTS, ROOT, machine_line, made_line, noted, picture, section, table
 from page_pictures import GROWTH, LEARNING, draw_pictures, is_stale, pictures
 from profile_page import profile_sections
-from readme_parts import GAIN_CHART, GIFTS_CHART, demo_table, gain, gains, gifts_sentence, readme
+from readme_parts import (
+    GAIN_CHART,
+    GIFTS_CHART,
+    HALF_HOUR_CHART,
+    demo_table,
+    gain,
+    gains,
+    gifts_sentence,
+    readme,
+)
 from sharpening import kept_by_grids, sharpening_sections
 from sizes_sections import scene_results, sizes_sections
 from sizes_tables import where_it_pays
@@ -42,7 +51,6 @@ PAGE = ROOT / "docs" / "results.md"
 MEASUREMENTS_PAGE = ROOT / "docs" / "measurements.md"
 SUITES_PAGE = ROOT / "docs" / "suites.md"
 README = ROOT / "README.md"
-HALF_HOUR_CHART = "caliterra-half-hour"
 STRETCH_CHART = "caliterra-stretch"
 """As the chart of the gain, in benchmarks/results/charts, tested on a stretch of the flight."""
 
@@ -269,10 +277,14 @@ def new_views() -> str:
 def half_an_hour() -> str:
     """What is left of the gain when there is time."""
     lines, anchor = lines_of(stored(HALF_HOUR_CHART)), heading_anchor(titles()[HALF_HOUR_CHART])
-    ends = [f"{line.name} has {line.psnr:.1f} dB ({last_gain(line):+.1f})" for line in lines]
+    ours, other = lines
+    ends = [f"{line.psnr:.1f} dB ({last_gain(line):+.1f})" for line in lines]
+    passed = ours.seconds_to(other.psnr)
     return (
         f"**After half an hour** of one core ([figures](measurements.md#{anchor}), one seed, so no "
-        f"verdict; gained in the last third in brackets), {', '.join(ends)}."
+        f"verdict), LeCO has {ends[0]} with a learned occupancy, and {ends[1]} as *{other.name}*; "
+        "in brackets what the last ten minutes brought. "
+        + ("" if passed is None else f"The first had passed the second by {passed:.0f} s.")
     )
 
 
