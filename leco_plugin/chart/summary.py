@@ -255,6 +255,9 @@ def headline(results: Mapping[str, Any], short: bool = False) -> str:
         return f"{ranked[0].name}: {ranked[0].psnr:.1f} dB"
     best, second = ranked[:2]
     found = compare(best.psnrs, second.psnrs)
+    both_figures = f"{best.psnr:.1f} dB for {best.name}, {second.psnr:.1f} next"
+    if found.margin is None and short:
+        return f"no verdict: {both_figures}"
     if found.margin is None:
         return f"{best.name} {best.psnr:.1f} dB, {second.name} {second.psnr:.1f} dB ({found.by})"
     apart = f"{found.difference:.2f} ± {found.margin:.2f}"
@@ -275,7 +278,7 @@ def headline(results: Mapping[str, Any], short: bool = False) -> str:
         level = f"{best.name} is level with the next best"
         if found.word == "level":
             return level
-        return f"undecided: {best.psnr:.1f} dB for {best.name}, {second.psnr:.1f} next"
+        return f"undecided: {both_figures}"
     if short:
         return f"{best.name} is ahead by {apart} dB"
     said = f"{best.name} is ahead: {best.psnr:.1f} dB, {apart} more than {second.name} ({found.by})"
