@@ -1,0 +1,46 @@
+"""What pages quote of the walk from photographs to a film."""
+
+from __future__ import annotations
+
+import walk
+
+LOG = """/somewhere/script.py:1: FutureWarning: old
+  warnings.warn(
+[15:33:03] Using --data alias                                          train.py:230
+SCENE: 148 photographs to learn from
+  rays from 0.2 to 0.8
+Training: 2% after 10 s
+Training: 27% after 2 min
+step 199: it learns on
+Training: 90% after 7 min
+finished: 4000 steps
+
+next:
+  ns-viewer
+real 507
+"""
+
+
+def test_a_page_quotes_what_is_ours_and_one_line_on_progress() -> None:
+    assert walk.lines_of(LOG) == [
+        "SCENE: 148 photographs to learn from",
+        "  rays from 0.2 to 0.8",
+        "Training: 27% after 2 min",
+        "step 199: it learns on",
+        "finished: 4000 steps",
+    ]
+    assert walk.REAL.findall(LOG) == ["507"]
+
+
+def test_the_readme_says_what_skipping_costs_and_what_another_run_lost() -> None:
+    lines = {"train": ["step 9: a gate of 7 values", "x"], "poses": ["2 of 3 are placed"]}
+    report = {
+        "lines": lines,
+        "seconds": {"poses": 60, "train": 100, "film": 20, "eval": 900},
+        "costs": {"lost_surface_mass": 7.8e-4, "worst_surface_mass": 0.0128},
+        "other_runs": [{"worst_surface_mass": 0.021}],
+    }
+    said = walk.quote(report)
+    assert said.startswith("```\nstep 9: a gate of 7 values\n2 of 3 are placed\n```\n\n")
+    assert "took 3 minutes" in said and "hide 0.08%" in said
+    assert said.endswith("the worst lost 1.3% (2.1% in another run).")
