@@ -43,6 +43,7 @@ def inspect(
     history: Path | None = None,
     data: Path | None = None,
     json: Path | None = None,
+    dark: bool = False,
 ) -> None:
     """Say what an occupancy is: sizes, threshold, price and gain; and draw it.
 
@@ -55,6 +56,7 @@ def inspect(
         data: The scene that it was learned on, for the colours of its sparse points in picture and
             page. By default that of the run it lies in.
         json: File for the same as JSON.
+        dark: Draw the picture for a dark page.
     """
     check_json(json)
     check_picture("--picture", picture)
@@ -81,7 +83,7 @@ def inspect(
             print(f"{name.replace('_', ' ')}: {_said(value)}")
     print("docs/file-format.md says what each of these is")
     if picture is not None:
-        _draw(occupancy, picture, scene_of(occupancy, file, data))
+        _draw(occupancy, picture, scene_of(occupancy, file, data), dark)
     if history is not None:
         from leco_plugin.evaluation.history_picture import draw_history
 
@@ -217,15 +219,16 @@ def shrink(
         print(f"drew {draw_gates(results, picture)}")
 
 
-def _draw(occupancy: Occupancy, picture: Path, description: Path | None) -> None:
+def _draw(occupancy: Occupancy, picture: Path, description: Path | None, dark: bool) -> None:
     """Draws an occupancy as a picture and as a page."""
+    from leco_plugin.chart.theme import DARK, LIGHT
     from leco_plugin.evaluation.inspection import scene_colours
     from leco_plugin.evaluation.occupancy_page import write_page
     from leco_plugin.evaluation.occupancy_picture import draw
 
     colours = scene_colours(occupancy, description)
     picture.parent.mkdir(parents=True, exist_ok=True)
-    print(f"drew {draw(occupancy, picture, colours=colours)}")
+    print(f"drew {draw(occupancy, picture, colours=colours, theme=DARK if dark else LIGHT)}")
     page = write_page(occupancy, picture.with_suffix(".html"), colours)
     print(f"drew {page}, to look around in with a browser")
     if colours is None:

@@ -51,6 +51,10 @@ def test_inspect_says_draws_and_writes(
     assert facts["format"] == 1 and facts["bytes"] == file.stat().st_size
     assert facts["params"] == ball().num_params
     assert facts["report"]["empty_fraction"] == 0.9
+    dark = tmp_path / "dark.png"
+    assert run("inspect", file, "--picture", dark, "--dark") == 0
+    grounds = [sum(Image.open(one).convert("RGB").getpixel((0, 0))) for one in (picture, dark)]
+    assert grounds[0] > 600 > 200 > grounds[1]
 
 
 def test_a_folder_of_runs_means_its_newest_occupancy(

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from leco_plugin.chart.theme import new_figure
+from leco_plugin.chart.theme import LIGHT, Theme, new_figure, themed
 from leco_plugin.evaluation.inspection import (
     SceneColours,
     ViewBox,
@@ -42,6 +42,8 @@ LAYERS, LAYER_CELLS = 24, 96
 """Heights that are compared for the slices of a picture, and cells along the longest side."""
 FLAT = 0.25
 """Height of a slice, in widths, below which heights are drawn longer, up to this."""
+TYPE = 10.0
+"""Points."""
 UNSEEN = "#8a8f98"
 COLOURS, CONTOUR, TRUTH, CAMERA = "magma", "#4fd8eb", "#ffffff", "#66e08a"
 AXES = "xyz"
@@ -54,6 +56,7 @@ def draw(
     path: str | Path,
     cameras: Tensor | None = None,
     colours: SceneColours | None = None,
+    theme: Theme = LIGHT,
 ) -> Path:
     """Draws two horizontal and two vertical slices of o(x), and the kept points.
 
@@ -61,15 +64,27 @@ def draw(
         path: its ending chooses the kind of the picture.
         cameras: [C, 3] camera centres, scene units; those of the report by default.
         colours: of the scene, drawn under the horizontal slices; None leaves them out.
+        theme: of the page that shows it.
     Raises:
         OSError, ValueError: the picture cannot be written there, or is of no known kind.
     """
+    kind = Path(path).suffix[1:].lower()
+    with themed(theme, TYPE):
+        figure = _figure(occupancy, cameras, colours, theme)
+        write_whole(Path(path), lambda file: figure.savefig(file, format=kind or None, dpi=DPI))
+    return Path(path)
+
+
+def _figure(
+    occupancy: Occupancy, cameras: Tensor | None, colours: SceneColours | None, theme: Theme
+) -> Any:
+    """What `draw` writes."""
     cameras = cameras_of(occupancy) if cameras is None else cameras.detach().cpu().float()
     box = interesting_box(occupancy, cameras)
     low, high = heights_seen_from_above(occupancy, box)
     points, normals = surface_points(occupancy, box, low)
     ground = None if colours is None else seen_from_above(occupancy, box, colours)
-    figure = new_figure((10.5, 6.4), layout="constrained")
+    figure = new_figure((10.5, 6.4), theme.page, layout="constrained")
     wide, tall = (box.high - box.low)[[0, 2]].tolist()
     ratios = (1.0, min(1.0, max(0.5, 1.6 * tall / wide)))
     grid = figure.add_gridspec(2, 6, height_ratios=ratios, hspace=0.04)
@@ -90,10 +105,8 @@ def draw(
     figure.suptitle(headline(occupancy), fontsize=15, fontweight="bold", x=0.01, ha="left")
     lines = title_of(occupancy), _legend(occupancy, cameras, ground is not None)
     below = "\n".join(" · ".join(parts) for parts in lines)
-    figure.supxlabel(below, fontsize=10, x=0.01, ha="left")
-    kind = Path(path).suffix[1:].lower()
-    write_whole(Path(path), lambda file: figure.savefig(file, format=kind or None, dpi=DPI))
-    return Path(path)
+    figure.supxlabel(below, fontsize=TYPE, x=0.01, ha="left")
+    return figure
 
 
 def draw_slice(
