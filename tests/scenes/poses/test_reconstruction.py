@@ -47,7 +47,7 @@ def test_photographs_that_do_not_overlap_end_in_one_line(
 
 def test_an_old_pycolmap_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pycolmap", SimpleNamespace(__version__="3.13.0"))
-    with pytest.raises(ImportError, match=r"too old for leco poses: pip install 'leco-plugin\[pos"):
+    with pytest.raises(ImportError, match=r"too old for leco poses: pip install 'pycolmap>=4'"):
         reconstruction.load_pycolmap()
 
 
