@@ -36,15 +36,20 @@ STANDS = {
 def readme(text: str) -> str:
     """The README with its tables renewed."""
     text = between(text, DEMO, demo_sentence(json.loads((RESULTS / "demo.json").read_text())))
-    gifts = json.loads((RESULTS / "charts" / f"{GIFTS_CHART}.json").read_text())
+    also = f" {without_gifts(_chart(GIFTS_CHART))} {after_half_an_hour(_chart(HALF_HOUR_CHART))}"
     text = with_walk(text, ("lines",))
-    half_hour = json.loads((RESULTS / "charts" / f"{HALF_HOUR_CHART}.json").read_text())
-    return between(text, GAIN, gain(f" {without_gifts(gifts)} {after_half_an_hour(half_hour)}"))
+    return between(text, GAIN, gain(also))
+
+
+def _chart(name: str) -> dict[str, Any]:
+    """The stored results of a chart."""
+    found: dict[str, Any] = json.loads((RESULTS / "charts" / f"{name}.json").read_text())
+    return found
 
 
 def gain(also: str = "") -> str:
     """What a learned occupancy gains, and what is to be known of that chart."""
-    chart = json.loads((RESULTS / "charts" / f"{GAIN_CHART}.json").read_text())
+    chart = _chart(GAIN_CHART)
     said = gain_table(chart, short=bool(also)) + also
     return "\n\n".join([said, *filter(None, [noted(RESULTS).get(GAIN_CHART)])])
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -43,7 +42,9 @@ from leco_plugin.learning.calibration import Measured, calibrate, measure
 from leco_plugin.learning.dense import DenseRendering, dense_rendering, in_chunks
 from leco_plugin.learning.sharpening import (
     Lesson,
+    Score,
     SharpeningConfig,
+    asked_by,
     lesson_by,
     seen_reference,
     sharpen,
@@ -51,7 +52,7 @@ from leco_plugin.learning.sharpening import (
 )
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.mixture import Mixture
-from leco_plugin.models.rendering import Rays, mapped_middles
+from leco_plugin.models.rendering import Rays
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.learning_data import on_black
 
@@ -62,8 +63,6 @@ KINDS = ("", ", dilated", ", dilated and interpolated")
 LOST = 1e-3
 """Share of the surface mass at which volumes are compared."""
 RAYS, PLACES = 8192, 1 << 17
-Score = Callable[[Tensor], Tensor]
-"""Of mapped positions [N, 3]: [N]."""
 SHOWN = ("threshold", "empty_fraction", "lost_surface_mass", "image_price_db")
 
 
@@ -72,15 +71,17 @@ def shown(measured: Measured) -> dict[str, float]:
     return {name: round(float(getattr(measured, name)), 6) for name in SHOWN}
 
 
-def asked(mixture: Mixture, score: Score, seen: Seen) -> DenseRendering:
-    """Some rays as prices are measured on them, with what a gate or a grid says of candidates."""
-    rendering = dense_rendering(mixture, seen.rays, on_black(seen.truth), 1024, seen_reference)
-    pairs = zip(in_chunks(seen.rays, 1024), rendering.references, strict=True)
-    said = [
-        one._replace(occupancies=score(mapped_middles(mixture.region.space, rays, one.intervals)))
-        for rays, one in pairs
-    ]
-    return rendering._replace(references=said)
+class Rendered:
+    """Some rays as prices are measured on them, rendered once for all that are asked."""
+
+    def __init__(self, mixture: Mixture, seen: Seen) -> None:
+        self.mixture, self.chunks = mixture, in_chunks(seen.rays, 1024)
+        given = mixture, seen.rays, on_black(seen.truth), 1024
+        self.rendering = dense_rendering(*given, seen_reference)
+
+    def asked(self, score: Score) -> DenseRendering:
+        """With what a gate or a grid says of candidates."""
+        return asked_by(self.mixture, score, self.chunks, self.rendering)
 
 
 def taught_by(source: Source, mixture: Mixture) -> dict[str, Any]:
@@ -93,6 +94,7 @@ def taught_by(source: Source, mixture: Mixture) -> dict[str, Any]:
     tests = draw_test_rays(source, occupancy, RAYS)
     assert tests is not None
     losses, calibration = model.config.gate_loss, model.config.calibration
+    on_held_out, on_tests = (Rendered(mixture, seen) for seen in (held_out, tests))
     rows, grids = [], []
     for seed in range(SEEDS):
         taught = rays_that_teach(source, occupancy, seed)
@@ -109,20 +111,20 @@ def taught_by(source: Source, mixture: Mixture) -> dict[str, Any]:
         assert found is not None
         seconds = time.process_time() - started
         small = partial(mixture.occupancies, gate=found.gate)
-        after = measure(*asked(mixture, small, tests), found.measured.threshold)
+        after = measure(*on_tests.asked(small), found.measured.threshold)
         rows.append(
             {"seconds": round(seconds, 1), "held_out": shown(found.measured), "test": shown(after)}
         )
         print(f"  seed {seed}: {rows[-1]}", flush=True)
         lesson = lesson_by(mixture, taught, losses, 1.0, 1024)
         of_seed = {}
-        for name, score in grid_scores(mixture, lesson).items():
-            measured = calibrate(*asked(mixture, score, held_out), calibration)
-            after = measure(*asked(mixture, score, tests), measured.threshold)
+        for name, (_, score) in grids_of(mixture, lesson).items():
+            measured = calibrate(*on_held_out.asked(score), calibration)
+            after = measure(*on_tests.asked(score), measured.threshold)
             of_seed[name] = {"held_out": shown(measured), "test": shown(after)}
         grids.append(of_seed)
     routing = partial(mixture.occupancies, gate=mixture.gate)
-    before = measure(*asked(mixture, routing, tests), float(mixture.threshold))
+    before = measure(*on_tests.asked(routing), float(mixture.threshold))
     first = {"held_out": shown(found.before), "test": shown(before)}
     return {"before": first, "small": rows, "grids": grids}
 
@@ -133,9 +135,9 @@ def rays_that_teach(source: Source, occupancy: Occupancy, seed: int) -> Rays:
     return draw_training_rays(source, occupancy, SharpeningConfig().rays).rays
 
 
-def grid_scores(mixture: Mixture, lesson: Lesson) -> dict[str, Score]:
-    """Grids of one lesson, by name, each as it is and as `KINDS` has it."""
-    found: dict[str, Score] = {}
+def grids_of(mixture: Mixture, lesson: Lesson) -> dict[str, tuple[int, Score]]:
+    """Grids of one lesson as `KINDS` has them, by name: bytes as bits, and the score."""
+    found: dict[str, tuple[int, Score]] = {}
     box = mapped_box(mixture)
     for n in GRIDS:
         filled = taught_grid(lesson, box, n)
@@ -145,16 +147,16 @@ def grid_scores(mixture: Mixture, lesson: Lesson) -> dict[str, Score]:
             partial(look_up_scores, wide, box),
             partial(interpolated, wide, box),
         )
-        found |= {f"grid {n}^3{kind}": score for kind, score in zip(KINDS, made, strict=True)}
+        size = -(-(n**3) // 8)
+        found |= {f"grid {n}^3{kind}": (size, one) for kind, one in zip(KINDS, made, strict=True)}
     return found
 
 
 def interpolated(scores: Tensor, box: ViewBox, mapped: Tensor) -> Tensor:
     """Scores [nx, ny, nz] between the middles of cells: of mapped positions [N, 3], [N]."""
     places = ((mapped - box.low) / (box.high - box.low) * 2.0 - 1.0).flip(-1)[None, None, None]
-    return grid_sample(scores[None, None], places, align_corners=False, padding_mode="border").view(
-        -1
-    )
+    given = scores[None, None], places
+    return grid_sample(*given, align_corners=False, padding_mode="border").flatten()
 
 
 def at_equal_loss(source: Source, mixture: Mixture) -> list[dict[str, Any]]:
@@ -182,9 +184,7 @@ def at_equal_loss(source: Source, mixture: Mixture) -> list[dict[str, Any]]:
         gate = teach(config.gate, heard, config.steps, mixture.precision)
         size = 2 * sum(p.numel() for p in gate.parameters())
         rivals[f"small gate, seed {seed}"] = (size, partial(mixture.occupancies, gate=gate))
-    for name, score in grid_scores(mixture, lesson).items():
-        cells = int(name.split("^")[0].removeprefix("grid "))
-        rivals[name] = (-(-(cells**3) // 8), score)
+    rivals |= grids_of(mixture, lesson)
     rows = []
     for name, (size, score) in rivals.items():
         of_volume, row = in_parts(score, places), {"name": name, "bytes": size}

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -246,9 +247,12 @@ def sharpen(
         rays, truth = held_out
         rendering = dense_rendering(mixture, rays, truth, at_once, seen_reference)
         before = measure(*rendering, float(mixture.threshold))
-        asked = asked_by(mixture, gate, in_chunks(rays, at_once), rendering)
+        score = partial(mixture.occupancies, gate=gate)
+        asked = asked_by(mixture, score, in_chunks(rays, at_once), rendering)
         of_each = [of_one for of_one, _ in cameras]
-        of_cameras = [_said_by(mixture, gate, one, seen_reference(mixture, one)) for one in of_each]
+        of_cameras = [
+            _said_by(mixture, score, one, seen_reference(mixture, one)) for one in of_each
+        ]
         measured = calibrate(*asked, calibration, cameras=of_cameras)
         promised = promise(of_cameras, measured, calibration)
     return Sharpened(gate, measured, before, promised)
@@ -314,14 +318,18 @@ def seen_reference(mixture: Mixture, rays: Rays) -> Reference:
     return Reference(intervals, weights, occupancies, surface, small.rgb, backdrops)
 
 
+Score = Callable[[Tensor], Tensor]
+"""o(x), or what stands for it: of mapped positions [M, 3], [M]."""
+
+
 def asked_by(
-    mixture: Mixture, gate: Gate, chunks: list[Rays], rendering: DenseRendering
+    mixture: Mixture, score: Score, chunks: list[Rays], rendering: DenseRendering
 ) -> DenseRendering:
-    """The same rendering of rays, with what another gate says of their candidates."""
+    """The same rendering of rays, with what another gate, or a grid, says of their candidates."""
     pairs = zip(chunks, rendering.references, strict=True)
-    return rendering._replace(references=[_said_by(mixture, gate, *pair) for pair in pairs])
+    return rendering._replace(references=[_said_by(mixture, score, *pair) for pair in pairs])
 
 
-def _said_by(mixture: Mixture, gate: Gate, rays: Rays, reference: Reference) -> Reference:
+def _said_by(mixture: Mixture, score: Score, rays: Rays, reference: Reference) -> Reference:
     mapped = mapped_middles(mixture.region.space, rays, reference.intervals)
-    return reference._replace(occupancies=mixture.occupancies(mapped, gate))
+    return reference._replace(occupancies=score(mapped))
