@@ -27,6 +27,7 @@ from leco_plugin.learning.schedule import ScheduleConfig, ramp
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.gate import Gate
 from leco_plugin.models.objective import GateLossConfig, field_losses, gate_losses
+from leco_plugin.models.region import reach_floor
 from leco_plugin.models.rendering import (
     Intervals,
     Rays,
@@ -52,6 +53,7 @@ class Weights(NamedTuple):
     termination: float = 0.03
     nearness: float = 0.03
     transparency: float = 1.0
+    ground: float = 0.1
 
 
 RATE = 5e-4
@@ -120,6 +122,7 @@ class Run:
             pixels.colors,
             None,
             None,
+            grounded=reach_floor(rays, self.scene.box)[0],
             span=self.span,
             unbounded=self.space.unbounded,
             learning=self.learning,

@@ -199,6 +199,7 @@ class LecoModel(DrawnInViewer, Model):
             self.renderer_rgb.blend_background(image),
             image[:, 3] if image.shape[-1] == 4 else None,
             None if known is None else known.to(self.device),
+            grounded=region.leaves_by_floor(outputs["rays"]),
             span=(region.near, region.far),
             unbounded=region.space.unbounded,
             learning=plan.coarse,

@@ -68,6 +68,9 @@ class LecoModelConfig(ModelConfig):
     scene for pixels that are nearly black."""
     transparency: float = 1.0
     """Weight of leaving what is seen through transparent pixels to the backdrop."""
+    ground: float = 0.1
+    """Weight of meeting the ground: a ray that leaves a bounded scene through its floor ends before
+    it, or bare ground would be left to the backdrop. Comes in with the distortion loss."""
     look_everywhere: float = 0.125
     """Share of rays that shade all candidates while the others follow the gate being learned."""
     likely_above: float = 0.05

@@ -167,25 +167,24 @@ def termination_loss(
     return (likelihoods * (distances > 0)).sum() / (distances > 0).sum().clamp(min=1)
 
 
-def transparency_loss(
-    weights: Tensor, is_backdrop: Tensor, ray_indices: Tensor, opacities: Tensor
+def backdrop_loss(
+    weights: Tensor, is_backdrop: Tensor, ray_indices: Tensor, wanted: Tensor, counts: Tensor
 ) -> Tensor:
-    """What is seen through a pixel is left to the backdrop: mean of (w - (1 - a))^2 over rays.
+    """Backdrops weigh what is known of them: mean of (w - wanted)^2 over all rays.
 
-    Of weight w of the backdrop and opacity a < 1. An opaque pixel says nothing: it may show the
-    backdrop, as a sky does.
+    What is seen through a pixel of opacity a weighs 1 - a. Where ground is met, nothing is left.
 
     Args:
         weights: [M] rendering weights.
         is_backdrop: bool [M].
         ray_indices: [M] int64.
-        opacities: [R] in [0, 1].
+        wanted: [R] in [0, 1].
+        counts: [R] in [0, 1], how much each ray counts; one without a backdrop does not.
     """
-    behind, meets = torch.zeros_like(opacities), torch.zeros_like(opacities)
-    behind = behind.index_add(0, ray_indices, weights * is_backdrop)
-    meets = meets.index_add(0, ray_indices, is_backdrop.to(meets.dtype))
-    wrong = (behind - (1.0 - opacities)) * (meets * (opacities < 1.0))
-    return wrong.square().sum() / max(len(opacities), 1)
+    last = is_backdrop.nonzero()[:, 0]
+    rays = ray_indices.index_select(0, last)
+    wrong = weights.index_select(0, last) - wanted.index_select(0, rays)
+    return (counts.index_select(0, rays) * wrong.square()).sum() / max(len(wanted), 1)
 
 
 def distortion_loss(

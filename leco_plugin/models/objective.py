@@ -13,6 +13,7 @@ from leco_plugin.models.gate import occupancy_from_logits
 from leco_plugin.models.losses import (
     adjoining,
     agreement_loss,
+    backdrop_loss,
     balance_loss,
     color_loss,
     contribution_loss,
@@ -20,7 +21,6 @@ from leco_plugin.models.losses import (
     distortion_loss,
     imbalanced_gate_loss,
     termination_loss,
-    transparency_loss,
     widen,
 )
 from leco_plugin.models.rendering import Intervals, Rays, Shaded, backdrop_of
@@ -80,6 +80,7 @@ class FieldLossWeights(Protocol):
     termination: float
     nearness: float
     transparency: float
+    ground: float
 
 
 def field_losses(
@@ -91,6 +92,7 @@ def field_losses(
     opacities: Tensor | None,
     distances: Tensor | None,
     *,
+    grounded: Tensor,
     span: tuple[Tensor, Tensor],
     unbounded: Tensor,
     learning: bool,
@@ -102,17 +104,21 @@ def field_losses(
         truth: [R, 3] colours.
         opacities: [R] of the pixels; None where all are opaque.
         distances: [R] to sparse points, scene units, 0 where none is known; None is no such points.
+        grounded: bool [R], which rays leave through the floor of a bounded scene.
         span: near and far, scalars, scene units.
         unbounded: scalar bool, whether a ray may go on to a sky of any colour; in a box nothing but
             darkness lies behind the scene.
         learning: whether this is the first phase.
-        ramped: how far the distortion loss has come in, in [0, 1]; nearness comes in with it.
+        ramped: how far the distortion loss has come in, in [0, 1]; nearness and ground come in with
+            it.
     """
     losses = {"rgb_loss": color_loss(shaded.rgb, truth)}
     near, far = span
+    dark = (1.0 - truth.amax(dim=-1) / DARK).clamp(min=0.0)
+    backdrops = shaded.weights, backdrop_of(intervals, rays), intervals.ray_indices
     if weights.transparency > 0.0 and opacities is not None:
-        losses["transparency_loss"] = weights.transparency * transparency_loss(
-            shaded.weights, backdrop_of(intervals, rays), intervals.ray_indices, opacities
+        losses["transparency_loss"] = weights.transparency * backdrop_loss(
+            *backdrops, 1.0 - opacities, (opacities < 1.0).to(opacities)
         )
     distortion = weights.distortion * ramped * (1.0 if learning else weights.distortion_after)
     if distortion > 0.0:
@@ -120,12 +126,17 @@ def field_losses(
         losses["distortion_loss"] = distortion * distortion_loss(
             shaded.weights, starts, ends, shaded.packed_info
         )
+    ground = weights.ground * ramped
+    if ground > 0.0:
+        opaque = (1.0 - dark) * (1.0 if opacities is None else opacities >= 1.0)
+        losses["ground_loss"] = ground * backdrop_loss(
+            *backdrops, torch.zeros_like(opaque), opaque * grounded
+        )
     if learning and weights.termination > 0.0 and distances is not None:
         losses["termination_loss"] = weights.termination * termination_loss(
             shaded.weights, intervals, distances
         )
     if learning and weights.nearness > 0.0:
-        dark = (1.0 - truth.amax(dim=-1) / DARK).clamp(min=0.0)
         nearness = (far - shaded.depth) / (far - near) * torch.where(unbounded, 1.0, dark)
         losses["nearness_loss"] = weights.nearness * ramped * nearness.mean()
     return losses

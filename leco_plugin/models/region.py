@@ -103,10 +103,8 @@ class Region(nn.Module):
 
     def leaves_by_floor(self, cut: Rays) -> Tensor:
         """Whether rays leave a bounded scene through its floor, inside its cube: bool [R]."""
-        ends = torch.addcmul(cut.origins, cut.directions, cut.t_maxs[:, None])
-        at_floor = (ends[:, 2] - self.aabb[2]).abs() <= 1e-3 * (self.aabb[5] - self.aabb[2])
-        inside = self.space.map(ends).abs().amax(dim=-1) <= 1.0
-        return at_floor & inside & (cut.t_maxs > cut.t_mins)
+        at_floor, ends = reach_floor(cut, self.aabb)
+        return at_floor & (self.space.map(ends).abs().amax(dim=-1) <= 1.0)
 
     def shows_backdrop(self, cut: Rays) -> Tensor:
         """Whether training has seen the backdrop of rays that are cut to the region: bool [R]."""
@@ -198,6 +196,13 @@ def cut_rays(
         leaves.clamp(min=0.0).clamp(max=far),
         images,
     )
+
+
+def reach_floor(cut: Rays, aabb: Tensor) -> tuple[Tensor, Tensor]:
+    """Whether rays that are cut to a box [6] end on its floor: bool [R]. And their ends [R, 3]."""
+    ends = torch.addcmul(cut.origins, cut.directions, cut.t_maxs[:, None])
+    at_floor = (ends[:, 2] - aabb[2]).abs() <= 1e-3 * (aabb[5] - aabb[2])
+    return at_floor & (cut.t_maxs > cut.t_mins), ends
 
 
 def with_ends_for_all(rays: Rays, far: Tensor, length: Tensor) -> Rays:

@@ -17,7 +17,12 @@ from leco_plugin.samplers.packed import pack_info
 NEAR, FAR = 1.0, 5.0
 RAYS = Rays(torch.zeros(2, 3), torch.eye(3)[:2], torch.ones(2), torch.full((2,), FAR), None)
 WEIGHTS = SimpleNamespace(
-    distortion=0.5, distortion_after=0.1, termination=0.3, nearness=0.2, transparency=0.0
+    distortion=0.5,
+    distortion_after=0.1,
+    termination=0.3,
+    nearness=0.2,
+    transparency=0.7,
+    ground=0.4,
 )
 
 
@@ -33,6 +38,7 @@ def found(ramped: float, learning: bool, unbounded: bool = True, **given: Any) -
         packed_info,
     )
     options: dict[str, Any] = {"opacities": None, "distances": None} | given
+    options.setdefault("grounded", torch.tensor([False, False]))
     truth = torch.tensor([[0.0, 0.0, 0.0], [0.9, 0.9, 0.9]])
     losses = field_losses(
         WEIGHTS,
@@ -46,6 +52,7 @@ def found(ramped: float, learning: bool, unbounded: bool = True, **given: Any) -
     units = ((t - NEAR) / (FAR - NEAR) for t in intervals[1:])
     return losses | {
         "raw distortion": distortion_loss(weights, *units, packed_info),
+        "behind": weights[[3, 7]],
         "raw termination": termination_loss(weights, intervals, torch.tensor([2.5, 0.0])),
     }
 
@@ -73,3 +80,22 @@ def test_known_distances_end_rays_while_an_occupancy_is_learned() -> None:
     losses = found(0.0, learning=True, distances=torch.tensor([2.5, 0.0]))
     torch.testing.assert_close(losses["termination_loss"], 0.3 * losses["raw termination"])
     assert "distortion_loss" not in losses  # before its ramp begins
+
+
+@pytest.mark.parametrize("learning", [True, False])
+def test_a_ray_that_leaves_by_the_floor_meets_the_ground(learning: bool) -> None:
+    floor = torch.tensor([True, True])
+    losses = found(0.5, learning, grounded=floor)
+    # behind the black pixel of the first ray there may be nothing at all
+    expected = 0.4 * 0.5 * losses["behind"][1] ** 2 / 2.0
+    torch.testing.assert_close(losses["ground_loss"], expected)
+    assert "ground_loss" not in found(0.0, learning, grounded=floor)  # before its ramp begins
+    assert found(1.0, learning)["ground_loss"].item() == 0.0  # they leave by the side
+
+
+def test_the_ground_is_what_a_transparent_pixel_does_not_show() -> None:
+    clear = torch.tensor([0.5, 0.5])
+    losses = found(1.0, True, grounded=torch.tensor([True, True]), opacities=clear)
+    assert losses["ground_loss"].item() == 0.0
+    expected = 0.7 * (losses["behind"] - 0.5).square().mean()
+    torch.testing.assert_close(losses["transparency_loss"], expected)

@@ -13,6 +13,7 @@ from leco_plugin.models.losses import (
     HUE_WEIGHT,
     adjoining,
     agreement_loss,
+    backdrop_loss,
     balance_loss,
     color_loss,
     contribution_loss,
@@ -21,7 +22,6 @@ from leco_plugin.models.losses import (
     expert_shares,
     imbalanced_gate_loss,
     termination_loss,
-    transparency_loss,
     widen,
 )
 from leco_plugin.models.rendering import Intervals
@@ -232,13 +232,13 @@ def test_what_is_seen_through_a_pixel_is_the_backdrops_weight() -> None:
     """A clear, a half clear and an opaque ray, of a sample and a backdrop; one meets nothing."""
     ray_indices = torch.arange(3).repeat_interleave(2)
     is_backdrop = torch.tensor([False, True]).repeat(3)
-    opacities = torch.tensor([0.0, 0.5, 1.0, 0.0])
+    wanted, counts = torch.tensor([1.0, 0.5, 0.0, 1.0]), torch.tensor([1.0, 0.5, 0.0, 1.0])
     right = torch.tensor([0.0, 1.0, 0.5, 0.5, 0.3, 0.7])
-    assert float(transparency_loss(right, is_backdrop, ray_indices, opacities)) == 0.0
+    assert float(backdrop_loss(right, is_backdrop, ray_indices, wanted, counts)) == 0.0
     wrong = torch.tensor([0.4, 0.6, 0.2, 0.8, 0.3, 0.7], requires_grad=True)
-    loss = transparency_loss(wrong, is_backdrop, ray_indices, opacities)
-    assert loss.item() == pytest.approx((0.4**2 + 0.3**2) / 4)
+    loss = backdrop_loss(wrong, is_backdrop, ray_indices, wanted, counts)
+    assert loss.item() == pytest.approx((0.4**2 + 0.5 * 0.3**2) / 4)
     (gradient,) = torch.autograd.grad(loss, wrong)
-    assert gradient[1] < 0.0 < gradient[3] and gradient[4:].abs().sum() == 0.0
+    assert gradient[1] < 0.0 < gradient[3] and gradient[[0, 2, 4, 5]].abs().sum() == 0.0
     nothing = torch.zeros(0)
-    assert float(transparency_loss(nothing, nothing.bool(), nothing.long(), nothing)) == 0.0
+    assert float(backdrop_loss(nothing, nothing.bool(), nothing.long(), nothing, nothing)) == 0.0
