@@ -27,7 +27,6 @@ from leco_plugin.learning.schedule import ScheduleConfig, ramp
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.gate import Gate
 from leco_plugin.models.objective import GateLossConfig, field_losses, gate_losses
-from leco_plugin.models.region import reach_floor
 from leco_plugin.models.rendering import (
     Intervals,
     Rays,
@@ -122,7 +121,7 @@ class Run:
             pixels.colors,
             None,
             None,
-            grounded=reach_floor(rays, self.scene.box)[0],
+            grounded=torch.zeros_like(rays.t_mins, dtype=torch.bool),  # a void is below
             span=self.span,
             unbounded=self.space.unbounded,
             learning=self.learning,

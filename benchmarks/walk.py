@@ -32,6 +32,8 @@ COMMANDS = {
     "export": "leco export RUN --out export",
 }
 """As the tutorial has them; a walk ends the viewer with the training."""
+SHOWN = ("poses", "train", "export")
+"""Commands whose lines pages quote; the others print paths of the machine."""
 NOISE = re.compile(r"/|\s+warnings\.|\[|=|finding |comparing |placing |real|user|sys|\s*$")
 """Lines of progress, of other packages, and of the shell."""
 REAL = re.compile(r"^real (\d+)", re.MULTILINE)
@@ -69,7 +71,7 @@ def report_of(folder: Path, known: dict[str, Any]) -> dict[str, Any]:
         "machine": describe_machine(),
         **made_by(describe_code()),
         "seconds": {name: int(REAL.findall(log)[-1]) for name, log in logs.items()},
-        "lines": {name: lines_of(log) for name, log in logs.items()},
+        "lines": {name: lines_of(logs[name]) for name in SHOWN},
         "costs": {
             "empty_fraction": said["empty_fraction"],
             "lost_surface_mass": said["lost_surface_mass"],

@@ -199,7 +199,7 @@ class LecoModel(DrawnInViewer, Model):
             self.renderer_rgb.blend_background(image),
             image[:, 3] if image.shape[-1] == 4 else None,
             None if known is None else known.to(self.device),
-            grounded=region.leaves_by_floor(outputs["rays"]),
+            grounded=region.meet_ground(outputs["rays"]),
             span=(region.near, region.far),
             unbounded=region.space.unbounded,
             learning=plan.coarse,
@@ -247,5 +247,5 @@ class LecoModel(DrawnInViewer, Model):
         Raises:
             InputError: the checkpoint is of an earlier version of this package.
         """
-        refuse_earlier(state_dict, prefix, "mixture.frozen")
+        refuse_earlier(state_dict, prefix, "mixture.region.lowest")
         super()._load_from_state_dict(state_dict, prefix, *rest)

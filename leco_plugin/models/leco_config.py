@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
@@ -69,8 +70,9 @@ class LecoModelConfig(ModelConfig):
     transparency: float = 1.0
     """Weight of leaving what is seen through transparent pixels to the backdrop."""
     ground: float = 0.1
-    """Weight of meeting the ground: a ray that leaves a bounded scene through its floor ends before
-    it, or bare ground would be left to the backdrop. Comes in with the distortion loss."""
+    """Weight of meeting the ground, in scenes photographed from above: a ray that would end below
+    the lowest sparse point ends before, or bare ground would be left to the backdrop. Comes in with
+    the distortion loss."""
     look_everywhere: float = 0.125
     """Share of rays that shade all candidates while the others follow the gate being learned."""
     likely_above: float = 0.05
@@ -98,3 +100,6 @@ class LecoModelConfig(ModelConfig):
         everywhere, above = self.look_everywhere, self.likely_above
         require(0.0 <= everywhere <= 1.0, "look-everywhere", everywhere, "from 0 to 1")
         require(0.0 <= above < 1.0, "likely-above", above, "at least 0 and below 1")
+        for name in ("distortion", "termination", "nearness", "transparency", "ground"):
+            weight = getattr(self, name)
+            require(0.0 <= weight < math.inf, name, weight, "a number, at least 0")

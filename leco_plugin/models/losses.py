@@ -170,7 +170,7 @@ def termination_loss(
 def backdrop_loss(
     weights: Tensor, is_backdrop: Tensor, ray_indices: Tensor, wanted: Tensor, counts: Tensor
 ) -> Tensor:
-    """Backdrops weigh what is known of them: mean of (w - wanted)^2 over all rays.
+    """Backdrops weigh what is known of them: mean of the squared difference over all rays.
 
     What is seen through a pixel of opacity a weighs 1 - a. Where ground is met, nothing is left.
 

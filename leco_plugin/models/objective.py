@@ -104,7 +104,7 @@ def field_losses(
         truth: [R, 3] colours.
         opacities: [R] of the pixels; None where all are opaque.
         distances: [R] to sparse points, scene units, 0 where none is known; None is no such points.
-        grounded: bool [R], which rays leave through the floor of a bounded scene.
+        grounded: bool [R], which rays are known to meet ground.
         span: near and far, scalars, scene units.
         unbounded: scalar bool, whether a ray may go on to a sky of any colour; in a box nothing but
             darkness lies behind the scene.

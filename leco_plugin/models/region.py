@@ -33,6 +33,7 @@ class Region(nn.Module):
         known: scalar bool, whether `set` was called.
         near, far: scalars, where all rays begin and end, scene units.
         aabb: [6] corners of the box in which rays are marched.
+        lowest: scalar, z below which ground hides everything; minus infinity if not known.
         backdrops: directions in which training has seen what lies beyond.
         seen: the space that training rays cross.
     """
@@ -41,6 +42,7 @@ class Region(nn.Module):
     near: Tensor
     far: Tensor
     aabb: Tensor
+    lowest: Tensor
 
     def __init__(self) -> None:
         super().__init__()
@@ -49,6 +51,7 @@ class Region(nn.Module):
         self.register_buffer("near", torch.tensor(0.05))
         self.register_buffer("far", torch.tensor(4.0))
         self.register_buffer("aabb", torch.tensor([-1.0] * 3 + [1.0] * 3))
+        self.register_buffer("lowest", torch.tensor(-torch.inf))
         self.backdrops = SeenBackdrops()
         self.seen = SeenSpace()
 
@@ -59,6 +62,7 @@ class Region(nn.Module):
         self.aabb.copy_(bounds.aabb)
         self.near.fill_(bounds.near)
         self.far.fill_(bounds.far)
+        self.lowest.fill_(-torch.inf if bounds.lowest is None else bounds.lowest)
         self.known.fill_(True)
 
     @torch.no_grad()
@@ -103,8 +107,16 @@ class Region(nn.Module):
 
     def leaves_by_floor(self, cut: Rays) -> Tensor:
         """Whether rays leave a bounded scene through its floor, inside its cube: bool [R]."""
-        at_floor, ends = reach_floor(cut, self.aabb)
-        return at_floor & (self.space.map(ends).abs().amax(dim=-1) <= 1.0)
+        ends = torch.addcmul(cut.origins, cut.directions, cut.t_maxs[:, None])
+        at_floor = (ends[:, 2] - self.aabb[2]).abs() <= 1e-3 * (self.aabb[5] - self.aabb[2])
+        inside = self.space.map(ends).abs().amax(dim=-1) <= 1.0
+        return at_floor & inside & (cut.t_maxs > cut.t_mins)
+
+    def meet_ground(self, cut: Rays) -> Tensor:
+        """Whether rays go on to where ground hides everything, on the floor or at `far`: bool [R].
+        They have met it on their way."""
+        ends = cut.origins[:, 2] + cut.directions[:, 2] * cut.t_maxs
+        return (ends < self.lowest) & (cut.t_maxs > cut.t_mins)
 
     def shows_backdrop(self, cut: Rays) -> Tensor:
         """Whether training has seen the backdrop of rays that are cut to the region: bool [R]."""
@@ -196,13 +208,6 @@ def cut_rays(
         leaves.clamp(min=0.0).clamp(max=far),
         images,
     )
-
-
-def reach_floor(cut: Rays, aabb: Tensor) -> tuple[Tensor, Tensor]:
-    """Whether rays that are cut to a box [6] end on its floor: bool [R]. And their ends [R, 3]."""
-    ends = torch.addcmul(cut.origins, cut.directions, cut.t_maxs[:, None])
-    at_floor = (ends[:, 2] - aabb[2]).abs() <= 1e-3 * (aabb[5] - aabb[2])
-    return at_floor & (cut.t_maxs > cut.t_mins), ends
 
 
 def with_ends_for_all(rays: Rays, far: Tensor, length: Tensor) -> Rays:

@@ -59,8 +59,9 @@ class SceneBounds:
     """[6] corners of the box in which rays are marched; +-NO_WALL where there is no wall."""
     reason: str
     """One line for the log: what was seen in the data."""
-    from_above: bool = False
-    """Whether planes were found for it because it was photographed from above."""
+    lowest: float | None = None
+    """z of the lowest sparse point of a scene that is photographed from above and whose planes were
+    found: what lies below is hidden by ground. None of others."""
 
 
 def find_bounds(
@@ -101,7 +102,7 @@ def find_bounds(
         top = float(high[2]) + 0.3 * relief
         why = f"photographed from above ({seen}): bounded"
         found = _slab(poses, directions, (ground, top), (near, far), why)
-        return replace(found, from_above=True)
+        return replace(found, lowest=float(low[2]))
     if config.space == "box":
         return _room(poses, low, high, near, far)
     half = float((high - low).max()) / 2

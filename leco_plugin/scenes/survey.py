@@ -147,7 +147,7 @@ def survey(
     poses = cameras.camera_to_worlds[chosen]
     flat_origins, flat_directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
     found = find_bounds(poses, directions, sparse_points(dataset), config)
-    if found.from_above:
+    if found.lowest is not None:
         missing = lengths_inside(found, flat_origins, flat_directions) <= 0.0
         seen = seen_beyond(dataset, chosen, missing.view(-1, SIDE, SIDE))
         if seen >= WORTH_IT:

@@ -27,7 +27,7 @@ WEIGHTS = SimpleNamespace(
 
 
 def found(ramped: float, learning: bool, unbounded: bool = True, **given: Any) -> dict[str, Tensor]:
-    """Losses of two rays of four samples, the pixels of which are black and bright."""
+    """Losses of two rays of four samples, the pixels of which are nearly black and bright."""
     starts = torch.arange(1.0, 5.0).repeat(2)
     intervals = Intervals(torch.arange(2).repeat_interleave(4), starts, starts + 1.0)
     torch.manual_seed(0)
@@ -39,7 +39,7 @@ def found(ramped: float, learning: bool, unbounded: bool = True, **given: Any) -
     )
     options: dict[str, Any] = {"opacities": None, "distances": None} | given
     options.setdefault("grounded", torch.tensor([False, False]))
-    truth = torch.tensor([[0.0, 0.0, 0.0], [0.9, 0.9, 0.9]])
+    truth = torch.tensor([[0.0, 0.06, 0.02], [0.9, 0.9, 0.9]])
     losses = field_losses(
         WEIGHTS,
         *(shaded, intervals, RAYS, truth),
@@ -67,7 +67,7 @@ def test_distortion_and_nearness_come_in_together(ramped: float) -> None:
 
 def test_in_a_bounded_scene_only_a_dark_pixel_prefers_to_be_far() -> None:
     losses = found(1.0, learning=True, unbounded=False)
-    torch.testing.assert_close(losses["nearness_loss"], torch.tensor(0.2 * 0.75 / 2.0))
+    torch.testing.assert_close(losses["nearness_loss"], torch.tensor(0.2 * 0.4 * 0.75 / 2.0))
 
 
 def test_after_learning_only_a_part_of_distortion_is_left() -> None:
@@ -83,19 +83,22 @@ def test_known_distances_end_rays_while_an_occupancy_is_learned() -> None:
 
 
 @pytest.mark.parametrize("learning", [True, False])
-def test_a_ray_that_leaves_by_the_floor_meets_the_ground(learning: bool) -> None:
-    floor = torch.tensor([True, True])
-    losses = found(0.5, learning, grounded=floor)
-    # behind the black pixel of the first ray there may be nothing at all
-    expected = 0.4 * 0.5 * losses["behind"][1] ** 2 / 2.0
+def test_a_ray_that_meets_ground_leaves_nothing_to_its_backdrop(learning: bool) -> None:
+    ground = torch.tensor([True, True])
+    losses = found(0.5, learning, grounded=ground)
+    # behind the nearly black pixel of the first ray there may be nothing at all
+    squares = losses["behind"].square()
+    expected = 0.4 * 0.5 * (0.6 * squares[0] + squares[1]) / 2.0
     torch.testing.assert_close(losses["ground_loss"], expected)
-    assert "ground_loss" not in found(0.0, learning, grounded=floor)  # before its ramp begins
-    assert found(1.0, learning)["ground_loss"].item() == 0.0  # they leave by the side
+    assert "ground_loss" not in found(0.0, learning, grounded=ground)  # before its ramp begins
+    one = found(1.0, learning, grounded=torch.tensor([True, False]))["ground_loss"]
+    torch.testing.assert_close(one, 0.4 * 0.6 * squares[0] / 2.0)
+    assert found(1.0, learning)["ground_loss"].item() == 0.0
 
 
-def test_the_ground_is_what_a_transparent_pixel_does_not_show() -> None:
-    clear = torch.tensor([0.5, 0.5])
-    losses = found(1.0, True, grounded=torch.tensor([True, True]), opacities=clear)
-    assert losses["ground_loss"].item() == 0.0
-    expected = 0.7 * (losses["behind"] - 0.5).square().mean()
-    torch.testing.assert_close(losses["transparency_loss"], expected)
+def test_a_transparent_pixel_shows_no_ground() -> None:
+    opacities = torch.tensor([1.0, 0.5])
+    losses = found(1.0, True, grounded=torch.tensor([True, True]), opacities=opacities)
+    behind = losses["behind"]
+    torch.testing.assert_close(losses["ground_loss"], 0.4 * 0.6 * behind[0] ** 2 / 2.0)
+    torch.testing.assert_close(losses["transparency_loss"], 0.7 * (behind[1] - 0.5) ** 2 / 2.0)

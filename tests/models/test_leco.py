@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import io
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -21,11 +22,12 @@ from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.mixture import Following
 from leco_plugin.models.objective import GateLossConfig
-from leco_plugin.models.rendering import Intervals, Rays
+from leco_plugin.models.rendering import Intervals, Rays, backdrop_of
 from leco_plugin.models.sizing.sizes import Sizes
 from leco_plugin.samplers.kernels import VARIABLE
 from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.space import NO_WALL
 
 NUM_RAYS = 12
 
@@ -132,6 +134,26 @@ def test_opacities_teach_only_where_there_are_any(model: LecoModel) -> None:
     assert model.get_loss_dict(outputs, {"image": opaque})["transparency_loss"].item() == 0.0
     clear = torch.cat([batch["image"], torch.zeros(NUM_RAYS, 1)], dim=-1)
     assert model.get_loss_dict(outputs, {"image": clear})["transparency_loss"].item() > 0.0
+
+
+def test_rays_that_end_below_the_lowest_point_are_taught_to_meet_ground(model: LecoModel) -> None:
+    """One ends on the floor, one at `far` below the lowest point, one above it, and one misses."""
+    walls = torch.tensor([-NO_WALL, -NO_WALL, -1.0, NO_WALL, NO_WALL, 1.0])
+    bounds = SceneBounds("box", torch.zeros(3), 4.0, 0.1, 2.0, walls, "")
+    ahead = torch.tensor([[0.0, 0.0, -1.0], [1.0, 0.0, -0.7], [1.0, 0.0, -0.4], [0.0, 0.0, 1.0]])
+    ahead = torch.nn.functional.normalize(ahead, dim=-1)
+    origins = torch.tensor([[0.0, 0.0, 0.5]] * 3 + [[0.0, 0.0, 1.5]])
+    bundle = RayBundle(origins, ahead, torch.ones(4, 1), torch.zeros(4, 1, dtype=torch.int64))
+    for lowest, expected in ((-0.5, [True, True, False, False]), (None, [False] * 4)):
+        model.mixture.set_bounds(replace(bounds, lowest=lowest), 2.0)
+        outputs = model.get_outputs(bundle)
+        region, rays = model.mixture.region, outputs["rays"]
+        assert region.meet_ground(rays).tolist() == expected
+        loss = model.get_loss_dict(outputs, {"image": torch.ones(4, 3)})["ground_loss"]
+        behind = backdrop_of(outputs["intervals"], rays)
+        weights = outputs["shaded"].weights[behind][torch.tensor(expected)]
+        assert len(weights) == sum(expected) and bool((weights > 0.0).all())
+        torch.testing.assert_close(loss, 0.05 * weights.square().sum() / 4.0)
 
 
 def test_a_batch_without_rays_says_so(model: LecoModel) -> None:

@@ -56,6 +56,16 @@ def test_a_scene_seen_from_above_is_a_box_that_holds_its_points() -> None:
     assert bool((ends > begins).all())
 
 
+def test_where_the_lowest_point_lies_is_known_of_a_scene_whose_planes_were_found() -> None:
+    poses, directions, points = from_above()
+    found = find_bounds(poses, directions, points)
+    assert found.lowest == points[:, 2].sort().values[round(0.001 * (len(points) - 1))]
+    assert float(found.aabb[2]) <= found.lowest - 0.199 * found.far
+    for config in (BoundsConfig(altitudes=(-0.5, 2.0)), BoundsConfig(space="contraction")):
+        assert find_bounds(poses, directions, points, config).lowest is None
+    assert find_bounds(*around(), BoundsConfig(space="box")).lowest is None
+
+
 def test_marched_samples_of_a_box_lie_in_its_space() -> None:
     poses, directions, points = from_above()
     bounds = find_bounds(poses, directions, points)
