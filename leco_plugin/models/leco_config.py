@@ -70,9 +70,9 @@ class LecoModelConfig(ModelConfig):
     transparency: float = 1.0
     """Weight of leaving what is seen through transparent pixels to the backdrop."""
     ground: float = 0.1
-    """Weight of meeting the ground, in scenes photographed from above: a ray that would end below
-    the lowest sparse point ends before, or bare ground would be left to the backdrop. Comes in with
-    the distortion loss."""
+    """Weight, while the occupancy is learned in a scene from above, of meeting the ground: a ray
+    that would end below the lowest sparse point ends before, or bare ground would be left to the
+    backdrop. Comes in with the distortion loss."""
     look_everywhere: float = 0.125
     """Share of rays that shade all candidates while the others follow the gate being learned."""
     likely_above: float = 0.05

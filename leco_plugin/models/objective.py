@@ -127,7 +127,7 @@ def field_losses(
             shaded.weights, starts, ends, shaded.packed_info
         )
     ground = weights.ground * ramped
-    if ground > 0.0:
+    if learning and ground > 0.0:
         opaque = (1.0 - dark) * (1.0 if opacities is None else opacities >= 1.0)
         losses["ground_loss"] = ground * backdrop_loss(
             *backdrops, torch.zeros_like(opaque), opaque * grounded
