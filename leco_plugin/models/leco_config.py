@@ -72,7 +72,7 @@ class LecoModelConfig(ModelConfig):
     ground: float = 0.1
     """Weight, while the occupancy is learned in a scene from above, of meeting the ground: a ray
     that would end below the lowest sparse point ends before, or bare ground would be left to the
-    backdrop. Comes in with the distortion loss."""
+    backdrop. Comes in with the distortion loss; not with altitudes set by hand."""
     look_everywhere: float = 0.125
     """Share of rays that shade all candidates while the others follow the gate being learned."""
     likely_above: float = 0.05

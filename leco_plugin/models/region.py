@@ -113,8 +113,7 @@ class Region(nn.Module):
         return at_floor & inside & (cut.t_maxs > cut.t_mins)
 
     def meet_ground(self, cut: Rays) -> Tensor:
-        """Whether rays go on to where ground hides everything, on the floor or at `far`: bool [R].
-        They have met it on their way."""
+        """Whether rays end below `lowest`, on the floor or at `far`: bool [R]."""
         ends = cut.origins[:, 2] + cut.directions[:, 2] * cut.t_maxs
         return (ends < self.lowest) & (cut.t_maxs > cut.t_mins)
 

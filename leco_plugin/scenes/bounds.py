@@ -60,8 +60,8 @@ class SceneBounds:
     reason: str
     """One line for the log: what was seen in the data."""
     lowest: float | None = None
-    """z of the lowest sparse point of a scene that is photographed from above and whose planes were
-    found: what lies below is hidden by ground. None of others."""
+    """z of the lowest sparse point, but for one in a thousand, of a scene that is photographed from
+    above and whose planes were found: what lies below is hidden by ground. None of others."""
 
 
 def find_bounds(
