@@ -114,11 +114,9 @@ def field_losses(
     """
     losses = {"rgb_loss": color_loss(shaded.rgb, truth)}
     near, far = span
-    dark = (1.0 - truth.amax(dim=-1) / DARK).clamp(min=0.0)
-    backdrops = shaded.weights, backdrop_of(intervals, rays), intervals.ray_indices
     if weights.transparency > 0.0 and opacities is not None:
         losses["transparency_loss"] = weights.transparency * backdrop_loss(
-            *backdrops, 1.0 - opacities, (opacities < 1.0).to(opacities)
+            *_backdrops(shaded, intervals, rays), 1.0 - opacities, (opacities < 1.0).to(opacities)
         )
     distortion = weights.distortion * ramped * (1.0 if learning else weights.distortion_after)
     if distortion > 0.0:
@@ -126,20 +124,28 @@ def field_losses(
         losses["distortion_loss"] = distortion * distortion_loss(
             shaded.weights, starts, ends, shaded.packed_info
         )
+    if not learning:
+        return losses
+    dark = (1.0 - truth.amax(dim=-1) / DARK).clamp(min=0.0)
     ground = weights.ground * ramped
-    if learning and ground > 0.0:
+    if ground > 0.0:
         opaque = (1.0 - dark) * (1.0 if opacities is None else opacities >= 1.0)
         losses["ground_loss"] = ground * backdrop_loss(
-            *backdrops, torch.zeros_like(opaque), opaque * grounded
+            *_backdrops(shaded, intervals, rays), torch.zeros_like(opaque), opaque * grounded
         )
-    if learning and weights.termination > 0.0 and distances is not None:
+    if weights.termination > 0.0 and distances is not None:
         losses["termination_loss"] = weights.termination * termination_loss(
             shaded.weights, intervals, distances
         )
-    if learning and weights.nearness > 0.0:
+    if weights.nearness > 0.0:
         nearness = (far - shaded.depth) / (far - near) * torch.where(unbounded, 1.0, dark)
         losses["nearness_loss"] = weights.nearness * ramped * nearness.mean()
     return losses
+
+
+def _backdrops(shaded: Shaded, intervals: Intervals, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
+    """Rendering weights [M], which of them are backdrops', and their rays."""
+    return shaded.weights, backdrop_of(intervals, rays), intervals.ray_indices
 
 
 def gate_losses(
