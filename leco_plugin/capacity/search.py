@@ -21,7 +21,7 @@ from leco_plugin.capacity.references import Bounds, Ground, Reference, Rung, ver
 from leco_plugin.evaluation.clock import seconds_now
 from leco_plugin.evaluation.field_grids import in_parts
 from leco_plugin.evaluation.inspection import whole_box
-from leco_plugin.learning.calibration import THRESHOLDS
+from leco_plugin.learning.calibration import thresholds_below
 from leco_plugin.learning.sharpening import Lesson, teach
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
@@ -313,7 +313,7 @@ def lower_threshold(ground: Ground, bounds: Bounds) -> Occupancy | None:
 
     if not absolute or meets(original):
         return None
-    lower = (original.with_threshold(t) for t in THRESHOLDS if t < original.threshold)
+    lower = map(original.with_threshold, thresholds_below(original.threshold))
     return next(filter(meets, lower), None)
 
 

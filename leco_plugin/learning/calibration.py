@@ -315,6 +315,12 @@ def is_missed(
     return (errors[0] < errors[1])[reference.intervals.ray_indices]
 
 
+def thresholds_below(threshold: float) -> list[float]:
+    """Those of `THRESHOLDS` that are lower, the highest first. A threshold that was kept in float32
+    may come back a little above the one that it was; that one is not lower."""
+    return [tried for tried in THRESHOLDS if tried < (1.0 - 1e-6) * threshold]
+
+
 def calibrate(
     references: list[Reference],
     truths: list[Tensor],
@@ -334,7 +340,7 @@ def calibrate(
             too much, see `worst_loss`, where that keeps no more than `MORE_KEPT` times as much.
     """
     parts, best = (references, truths, render_kept), None
-    for threshold in (tried for tried in THRESHOLDS if tried < below):
+    for threshold in thresholds_below(below):
         beyond = worst_loss(cameras, threshold) > config.camera_surface_mass
         if best is not None and beyond:
             continue

@@ -77,7 +77,7 @@ def find_unneeded(
             for some in in_chunks(rays, rays_at_once)
         ]
         truths = truth.split(rays_at_once)
-        experts = mixture.field.experts
+        experts, reachable = mixture.field.experts, mixture.gate.config.scene_experts
         shares, before = _surface_and_error(mixture, kept, truths)
         out: list[tuple[int, torch.nn.Module]] = []
         dropped: list[Trial] = []
@@ -85,6 +85,7 @@ def find_unneeded(
         try:
             while int(experts.left.sum()) > 1 and refused is None:
                 held = shares[1:].masked_fill(~experts.left.cpu(), torch.inf)
+                held[reachable:] -= 1.0  # what no gate sends points to leaves first
                 expert = int(held.argmin()) + 1
                 share = float(shares[expert])
                 out.append((expert, experts.drop(expert)))

@@ -19,7 +19,7 @@ from leco_plugin.learning.collapse import (
     look,
     may_fall_back,
 )
-from leco_plugin.learning.freezing import HARDLY_ANYTHING, withdraw_file
+from leco_plugin.learning.freezing import HARDLY_ANYTHING, leave_file, withdraw_file
 from leco_plugin.learning.run import Progress, Run
 from leco_plugin.log import say
 from leco_plugin.models.compute.ranks import share
@@ -98,12 +98,21 @@ class Recoveries:
         return True
 
     def reopen_useless(self, step: int) -> None:
-        """Opens a frozen gate that keeps nothing.
+        """Opens a frozen gate that keeps nothing; with too few steps left to learn in, it stays
+        frozen and keeps everything.
 
         Raises:
             GateCollapsed: it was healed as often as it may be.
         """
         cause = "the frozen gate keeps nothing of what the cameras see"
+        if not is_enough(self._room(step)):
+            mixture, lowered = self.mixture, self.mixture.report.get("lowered", [])
+            everything = Measured(0.0, *[0.0] * 4)._asdict()
+            mixture.freeze(0.0, mixture.report | everything | {"lowered": [*lowered, [step, 0.0]]})
+            if self.run.folder is not None:
+                leave_file(mixture.occupancy(), self.run.folder)
+            say(f"step {step}: {cause}, and few steps are left: from now on nothing is skipped")
+            return
         if self.progress.recoveries >= MOST_RECOVERIES:
             after = f"after {MOST_RECOVERIES} recoveries"
             raise GateCollapsed(f"step {step}: {cause}, {after}. {REMEDY}")

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from leco_plugin.learning.run import Progress
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, require
 
 KEPT_ABOVE = 0.1
 """o(x) from which a sample counts as kept before there is a calibrated threshold."""
@@ -52,6 +52,11 @@ class ScheduleConfig:
             if getattr(self, name) < 1:
                 option = f"schedule.{name.replace('_', '-')}"
                 raise InputError(f"{option} is {getattr(self, name)}; it takes at least one step")
+        for name in ("settled", "earliest", "ramp_from", "ramp_to", "agreement"):
+            share = getattr(self, name)
+            require(0.0 <= share <= 1.0, f"schedule.{name.replace('_', '-')}", share, "from 0 to 1")
+        every = self.steps_per_record
+        require(every >= 0, "schedule.steps-per-record", every, "at least 0")
 
 
 def ramp(step: int, config: ScheduleConfig) -> float:

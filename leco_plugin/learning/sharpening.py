@@ -36,13 +36,13 @@ from leco_plugin.learning.dense import (
 )
 from leco_plugin.learning.schedule import RATES
 from leco_plugin.models.encodings import EncodingConfig
-from leco_plugin.models.gate import Gate, GateConfig, occupancy_logit
+from leco_plugin.models.gate import Gate, GateConfig, check_sizes, occupancy_logit
 from leco_plugin.models.losses import widen
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.rendering import Intervals, Rays, backdrop_of, mapped_middles
 from leco_plugin.occupancy import CAMERAS_THAT_VOUCH, Precision, gate_precision
-from leco_plugin.scenes.input_error import require
+from leco_plugin.scenes.input_error import InputError, require
 
 BATCH = 1 << 11
 """Positions of a step. In the same time many steps of few teach more than few of many."""
@@ -155,6 +155,10 @@ class SharpeningConfig:
         require(self.steps >= 0, "sharpening.steps", self.steps, "at least 0")
         require(self.least_steps >= 0, "sharpening.least-steps", self.least_steps, "at least 0")
         require(self.rays >= 1, "sharpening.rays", self.rays, "at least 1")
+        try:
+            check_sizes(self.gate)
+        except ValueError as error:
+            raise InputError(f"sharpening.gate: {error}; no size of it is automatic") from None
 
 
 def added_costs(found: dict[str, Any], before: dict[str, Any]) -> dict[str, float]:

@@ -108,7 +108,10 @@ class LecoModel(DrawnInViewer, Model):
     def learner(self, manager: Any, run: Run) -> Learner:
         """What carries the mixture through a run on the data of a data manager."""
         config = self.config
-        data = LearningData(manager, config.bounds, config.near, config.far)
+        asked = config.bounds, config.near, config.far
+        if bool(self.mixture.region.known):
+            self.mixture.region.refuse_others(*asked)
+        data = LearningData(manager, *asked)
         return Learner(self.mixture, data, run, config, self.progress)
 
     def leco_drawn(self) -> Drawn | None:

@@ -16,7 +16,7 @@ from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.sizing.sizes import SMALL, Sizes
 from leco_plugin.occupancy import Precision
 from leco_plugin.scenes.bounds import BoundsConfig
-from leco_plugin.scenes.input_error import require
+from leco_plugin.scenes.input_error import InputError, require
 
 
 @dataclass
@@ -100,6 +100,12 @@ class LecoModelConfig(ModelConfig):
         everywhere, above = self.look_everywhere, self.likely_above
         require(0.0 <= everywhere <= 1.0, "look-everywhere", everywhere, "from 0 to 1")
         require(0.0 <= above < 1.0, "likely-above", above, "at least 0 and below 1")
-        for name in ("distortion", "termination", "nearness", "transparency", "ground"):
-            weight = getattr(self, name)
-            require(0.0 <= weight < math.inf, name, weight, "a number, at least 0")
+        weights = ("distortion", "termination", "nearness", "transparency", "ground")
+        for name in (*weights, "distortion_after"):
+            option, weight = name.replace("_", "-"), getattr(self, name)
+            require(0.0 <= weight < math.inf, option, weight, "a number, at least 0")
+        if self.homogeneous and self.schedule.steps_per_record > 0:
+            raise InputError(
+                "schedule.steps-per-record draws how an occupancy is learned, and homogeneous "
+                "learns none: leave one of them out"
+            )

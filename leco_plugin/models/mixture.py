@@ -28,7 +28,7 @@ from leco_plugin.models.rendering import (
     weigh,
     with_backdrop,
 )
-from leco_plugin.models.sizing.sizes import SIZES, Sizes, stored_in, to_store
+from leco_plugin.models.sizing.sizes import SIZES, Sizes, from_stored, to_store
 from leco_plugin.occupancy import SHOWN, Occupancy, Precision, gate_precision
 from leco_plugin.samplers import marching
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
@@ -230,6 +230,7 @@ class Mixture(nn.Module):
         self.threshold.fill_(threshold)
         self.frozen.fill_(True)
         self.gate.requires_grad_(False)
+        self.gate.zero_grad()  # gradients that are still being gathered would move it once more
         self.report = report
         self._estimator = ()
 
@@ -312,18 +313,17 @@ class Mixture(nn.Module):
         """
         extra = state_dict.get(f"{prefix}_extra_state")
         if extra is not None:
-            now = self.sizes, self.num_images
+            with state_of_this_version():
+                sizes, small = extra[SIZES], extra["small"]
+                gate = None if small is None else Gate(GateConfig.from_dict(small))
             try:
-                stored = stored_in(extra, now)
+                stored = from_stored(sizes, self.sizes)
             except ValueError as error:
                 raise InputError(str(error)) from None
-            if stored != now:
+            if stored != (self.sizes, self.num_images):
                 device = self.device
                 self._build(*stored)
                 self.to(device)
-            with state_of_this_version():
-                small = extra["small"]
-                gate = None if small is None else Gate(GateConfig.from_dict(small))
             self.small = None if gate is None else gate.to(self.device)
         super()._load_from_state_dict(state_dict, prefix, *rest)
 

@@ -11,7 +11,8 @@ from torch import Tensor, nn
 from leco_plugin.models.rendering import Rays
 from leco_plugin.samplers import marching
 from leco_plugin.samplers.boxes import intersect_box
-from leco_plugin.scenes.bounds import SceneBounds
+from leco_plugin.scenes.bounds import BoundsConfig, SceneBounds
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.seen import SeenSpace
 from leco_plugin.space import Space, SpaceKind
 
@@ -64,6 +65,23 @@ class Region(nn.Module):
         self.far.fill_(bounds.far)
         self.lowest.fill_(-torch.inf if bounds.lowest is None else bounds.lowest)
         self.known.fill_(True)
+
+    def refuse_others(self, bounds: BoundsConfig, near: float | None, far: float | None) -> None:
+        """InputError if near, far or bounds that are set by hand are not those of the region."""
+        kind = "contraction" if bool(self.space.unbounded) else "box"
+        asked: dict[str, tuple[Any, Tensor]] = {"near": (near, self.near), "far": (far, self.far)}
+        if kind == "box":
+            asked["bounds.altitudes"] = (bounds.altitudes, self.aabb[2::3])
+        same = {"bounds.space": bounds.space in ("auto", kind)} | {
+            option: now is None or torch.allclose(torch.tensor(now).to(there), there, rtol=1e-5)
+            for option, (now, there) in asked.items()
+        }
+        other = [option for option, is_same in same.items() if not is_same]
+        if other:
+            raise InputError(
+                f"--pipeline.model.{other[0]} is another one than the run was begun with that is "
+                "gone on with: leave it out, or begin a new run"
+            )
 
     @torch.no_grad()
     def look(self, origins: Tensor, directions: Tensor) -> None:

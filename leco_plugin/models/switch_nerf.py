@@ -129,9 +129,11 @@ class SwitchNerfModel(Model):
     ) -> list[TrainingCallback]:
         """Finds the scene's bounds now, and returns what updates the estimator before each step."""
         assert training_callback_attributes.pipeline is not None
-        if not bool(self.region.known):
-            manager, config = training_callback_attributes.pipeline.datamanager, self.config
-            data = LearningData(manager, config.bounds, config.near, config.far)
+        asked = self.config.bounds, self.config.near, self.config.far
+        if bool(self.region.known):
+            self.region.refuse_others(*asked)
+        else:
+            data = LearningData(training_callback_attributes.pipeline.datamanager, *asked)
             self.set_bounds(data.survey.bounds, data.survey.median_length)
             self.region.look(*data.covering_rays())
             announce(data.survey)

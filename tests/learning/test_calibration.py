@@ -19,6 +19,7 @@ from leco_plugin.learning.calibration import (
     measure,
     promise,
     ray_prices,
+    thresholds_below,
     worst_loss,
 )
 from leco_plugin.learning.dense import (
@@ -381,3 +382,9 @@ def test_only_lower_thresholds_are_tried_where_that_is_asked() -> None:
     assert calibrate(*parts, free).threshold == THRESHOLDS[0]
     assert calibrate(*parts, free, below=THRESHOLDS[3]).threshold == THRESHOLDS[4]
     assert calibrate(*parts, free, below=THRESHOLDS[-1]).threshold == 0.0
+
+
+@pytest.mark.parametrize("number", range(len(THRESHOLDS)))
+def test_lower_than_a_threshold_that_was_kept_in_float32_is_the_next_one(number: int) -> None:
+    kept = float(torch.tensor(THRESHOLDS[number], dtype=torch.float32))
+    assert thresholds_below(kept) == list(THRESHOLDS[number + 1 :])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import io
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -192,3 +193,15 @@ def test_the_log_says_what_was_dropped_and_why_no_more(mixture: Mixture) -> None
     line = line_of(found, 4 - len(found.dropped))
     assert found.refused is not None
     assert f"without {found.refused.expert} (" in line and "would lose" in line
+
+
+def test_experts_that_the_gate_cannot_reach_leave_first() -> None:
+    torch.manual_seed(0)
+    sizes = replace(SIZES, gate=replace(SIZES.gate, scene_experts=2))
+    mixture = Mixture(sizes, 3, "float32", Routing(0.2, False))
+    torch.nn.init.constant_(mixture.gate.head.bias, 0.0)
+    with torch.no_grad():
+        mixture.gate.head.bias[0] = 20.0  # nothing lies on any scene expert
+    mixture.freeze(0.0, {})
+    found = unneeded(mixture, torch.rand(200, 3), 99.0)
+    assert [trial.expert for trial in found.dropped][:2] == [3, 4] and len(found.dropped) == 3

@@ -298,3 +298,15 @@ def test_a_field_that_learns_a_wire_lowers_the_threshold_until_the_wire_is_kept(
     assert report["image_price_db"] <= CONFIG.image_price_db and report["empty_fraction"] > 0.8
     go(1001, 3000)
     assert run.saved == [1000] and mixture.training
+
+
+def test_a_gate_that_keeps_nothing_near_the_end_stays_frozen_and_keeps_everything(
+    watched: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    watched.run.end = 400
+    watched.kept = 0.0
+    watched.go(280, 400)
+    assert bool(watched.mixture.frozen) and float(watched.mixture.threshold) == 0.0
+    assert Occupancy.load(tmp_path / FILE_NAME).threshold == 0.0
+    assert watched.mixture.report["empty_fraction"] == 0.0
+    assert "keeps nothing of what the cameras see, and" in " ".join(capsys.readouterr().out.split())

@@ -121,3 +121,15 @@ def test_without_an_empty_expert_points_routed_to_it_have_no_density() -> None:
     routes = torch.tensor([0, 1, 2, 0])
     sigmas, _ = field.density(torch.rand(4, 3), routes, torch.ones(4))
     assert torch.equal(sigmas > 0.0, routes > 0)
+
+
+@pytest.mark.parametrize("apart", [(0.0,), (0.0, 0.05), (0.0,) * 6, (0.0, 0.05, 0.1, 0.05, 0.1)])
+def test_codes_drift_smoothly_where_photographs_share_a_place(apart: tuple[float, ...]) -> None:
+    stations = torch.arange(40.0).repeat_interleave(len(apart))
+    places = torch.zeros(len(stations), 3)
+    places[:, 0] = stations + torch.tensor(apart).repeat(40)
+    film = torch.zeros(400, 3)
+    film[:, 0] = torch.linspace(10.0, 30.0, 400)
+    codes = codes_nearby(stations[:, None], places, film)[:, 0]
+    steps = codes.diff()
+    assert float(steps.max()) < 1.5 * float(steps.mean())

@@ -36,3 +36,14 @@ def test_a_gate_that_is_frozen_again_skips_by_its_new_threshold() -> None:
         mixture.freeze(threshold, {})
         found = mixture.estimator().occupancy.threshold
         assert abs(found - threshold) < 1e-6
+
+
+def test_a_frozen_gate_is_not_moved_by_gradients_that_were_being_gathered() -> None:
+    mixture = small_mixture()
+    optimizer = torch.optim.Adam(mixture.gate.parameters(), lr=0.01)
+    places = torch.rand(50, 3) * 2 - 1
+    mixture.gate(places).square().mean().backward()
+    before = mixture.occupancies(places)
+    mixture.freeze(0.1, {})
+    optimizer.step()
+    torch.testing.assert_close(mixture.occupancies(places), before, rtol=0.0, atol=0.0)

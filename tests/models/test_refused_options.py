@@ -12,13 +12,21 @@ import tyro
 from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.merging import MergingConfig
 from leco_plugin.learning.schedule import ScheduleConfig
+from leco_plugin.learning.sharpening import SharpeningConfig
+from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.objective import GateLossConfig
+from leco_plugin.models.sizing.sizes import SMALL, check
 from leco_plugin.scenes.input_error import InputError
 
 NO_NUMBERS = (math.nan, math.inf)
 REFUSED: dict[tuple[Any, str], tuple[Any, ...]] = {
     (ScheduleConfig(), "learn_steps"): (0, -1),
+    (ScheduleConfig(), "steps_per_record"): (-1,),
+    **{
+        (ScheduleConfig(), name): (-0.1, 1.1, math.nan)
+        for name in ("settled", "earliest", "ramp_from", "ramp_to", "agreement")
+    },
     (CalibrationConfig(), "rays"): (0, -1),
     (CalibrationConfig(), "rays_at_once"): (0, -1),
     (CalibrationConfig(), "recheck_rays"): (-1,),
@@ -37,6 +45,7 @@ REFUSED_OF_THE_GATE: dict[str, tuple[float, ...]] = {
 REFUSED_OF_THE_MODEL: dict[str, tuple[float, ...]] = {
     "look_everywhere": (-0.1, 1.1, math.nan),
     "likely_above": (-0.1, 1.0, math.nan),
+    "distortion_after": (-0.1, *NO_NUMBERS),
 }
 ALLOWED: dict[Any, dict[str, Any]] = {
     CalibrationConfig(): {"recheck_rays": 0, "lost_surface_mass": 0.0, "image_price_db": 0.0},
@@ -96,3 +105,29 @@ def test_on_the_command_line_it_ends_with_status_2(
     said = capsys.readouterr().err
     assert f"{option} is {value}; it must be" in " ".join(said.replace("│", " ").split())
     assert "Traceback" not in said
+
+
+@pytest.mark.parametrize("name", ["width", "layers", "scene_experts"])
+@pytest.mark.parametrize("size", [0, -1])
+def test_a_small_gate_that_cannot_be_built_is_refused_before_the_run(name: str, size: int) -> None:
+    with pytest.raises(InputError, match=f"sharpening.gate: the gate's {name} is {size}, not in 1"):
+        SharpeningConfig(gate=GateConfig(**{name: size}))
+
+
+def test_what_homogeneous_experts_learn_has_no_history() -> None:
+    with pytest.raises(InputError, match=r"steps-per-record .* homogeneous learns none"):
+        LecoModelConfig(homogeneous=True, schedule=ScheduleConfig(steps_per_record=10))
+
+
+@pytest.mark.parametrize("batch", [0.0, 0.05, -1.0, *NO_NUMBERS])
+def test_batches_of_no_rays_are_refused(batch: float) -> None:
+    with pytest.raises(ValueError, match=r"sizes\.guided-batch is .*at least 0\.125"):
+        check(replace(SMALL, guided_batch=batch))
+
+
+@pytest.mark.parametrize(
+    ("name", "size"), [("appearance_dim", -1), ("direction_octaves", -1), ("color_width", 0)]
+)
+def test_a_field_that_cannot_be_built_is_refused(name: str, size: int) -> None:
+    with pytest.raises(ValueError, match=f"the field's {name} is {size}, below"):
+        check(replace(SMALL, field=replace(SMALL.field, **{name: size})))

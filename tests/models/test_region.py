@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -9,7 +11,8 @@ from leco_plugin.models.region import Region, marching_rule
 from leco_plugin.models.rendering import Rays
 from leco_plugin.samplers import marching
 from leco_plugin.samplers.marching import March, march
-from leco_plugin.scenes.bounds import SceneBounds
+from leco_plugin.scenes.bounds import BoundsConfig, SceneBounds
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.space import NO_WALL
 
 SLAB = torch.tensor([-NO_WALL, -NO_WALL, -1.0, NO_WALL, NO_WALL, 1.0])
@@ -76,3 +79,23 @@ def test_a_ray_along_a_wall_that_misses_the_box_stays_finite() -> None:
     assert bool(rays.t_mins.isfinite())
     assert bool(rays.t_maxs.isfinite())
     assert bool(rays.t_maxs <= rays.t_mins)
+
+
+@pytest.mark.parametrize(
+    ("asked", "option"),
+    [
+        ((BoundsConfig(), 0.2, None), "near"),
+        ((BoundsConfig(), None, 3.0), "far"),
+        ((BoundsConfig(altitudes=(-1.0, 0.5)), None, None), "bounds.altitudes"),
+        ((BoundsConfig(space="contraction"), None, None), "bounds.space"),
+        ((BoundsConfig(), None, None), None),
+        ((BoundsConfig("box", (-1.0, 1.0)), 0.1, 4.0), None),
+    ],
+)
+def test_a_run_that_is_gone_on_with_lies_where_it_was_begun(asked: Any, option: Any) -> None:
+    region = region_of(torch.tensor([-1.0] * 3 + [1.0] * 3), far=4.0)
+    if option is None:
+        region.refuse_others(*asked)
+        return
+    with pytest.raises(InputError, match=rf"--pipeline\.model\.{option} is another one than"):
+        region.refuse_others(*asked)

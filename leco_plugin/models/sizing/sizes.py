@@ -3,6 +3,7 @@ cannot be built or trained."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -131,15 +132,18 @@ def left_open(sizes: Sizes) -> list[str]:
 
 SIZES = "sizes"
 """Key in the extra state of a model."""
+MARCHED = ("candidates", "learn_candidates")
+"""Sizes from which the steps along rays are found, once in a run."""
 
 
 def to_store(sizes: Sizes, images: int) -> dict[str, Any]:
-    """What gate and field are built from, as plain values."""
-    return {"gate": asdict(sizes.gate), "field": asdict(sizes.field), "images": images}
+    """What gate and field are built from and how rays are marched, as plain values."""
+    stored = {"gate": asdict(sizes.gate), "field": asdict(sizes.field), "images": images}
+    return stored | {name: getattr(sizes, name) for name in MARCHED}
 
 
 def from_stored(values: dict[str, Any], sizes: Sizes) -> tuple[Sizes, int]:
-    """Inverse of `to_store`; what is not of gate and field is that of `sizes`.
+    """Inverse of `to_store`; what it does not hold is that of `sizes`.
 
     Raises:
         ValueError: there is a size in it that this release does not know.
@@ -149,21 +153,13 @@ def from_stored(values: dict[str, Any], sizes: Sizes) -> tuple[Sizes, int]:
         field["encoding"] = EncodingConfig(**field["encoding"])
         field["experts"] = HMoEConfig(**field["experts"])
         gate = GateConfig.from_dict(values["gate"])
-        return replace(sizes, gate=gate, field=FieldConfig(**field)), int(values["images"])
+        marched = {name: int(values[name]) for name in MARCHED}
+        found = replace(sizes, gate=gate, field=FieldConfig(**field), **marched)
+        return found, int(values["images"])
     except (KeyError, TypeError) as error:
         raise ValueError(
             f"the checkpoint's sizes are of another release of this package ({error})"
         ) from None
-
-
-def stored_in(extra: Any, now: tuple[Sizes, int]) -> tuple[Sizes, int]:
-    """Sizes and number of images in the extra state of a model, or those that it has now.
-
-    Raises:
-        ValueError: there is a size in it that this release does not know.
-    """
-    values = extra.get(SIZES) if isinstance(extra, dict) else None
-    return now if values is None else from_stored(values, now[0])
 
 
 def sizes_in(checkpoint: Path) -> dict[str, Any] | None:
@@ -199,7 +195,7 @@ def sizes_to_resume(wanted: Sizes, stored: dict[str, Any]) -> Sizes:
 
 
 def _paths(sizes: Sizes) -> list[str]:
-    """Dotted paths of everything that gate and field are built from."""
+    """Dotted paths of everything that a run goes on with as it was begun."""
 
     def below(values: dict[str, Any], path: str) -> list[str]:
         found: list[str] = []
@@ -209,7 +205,7 @@ def _paths(sizes: Sizes) -> list[str]:
         return found
 
     stored = to_store(sizes, 0)
-    return below(stored["gate"], "gate") + below(stored["field"], "field")
+    return [*below(stored["gate"], "gate"), *below(stored["field"], "field"), *MARCHED]
 
 
 BYTES_PER_VALUE = 16
@@ -234,6 +230,10 @@ def state_bytes(sizes: Sizes, images: int) -> int:
     return BYTES_PER_VALUE * values_of(sizes, images)
 
 
+LEAST_BATCH = 0.125
+"""Batches are rounded to eighths of those of the config."""
+
+
 def check(sizes: Sizes) -> None:
     """Refuses what cannot be built, before anything of it is allocated.
 
@@ -242,9 +242,13 @@ def check(sizes: Sizes) -> None:
     """
     check_sizes(sizes.gate)
     _check_field(sizes)
-    for name in ("candidates", "learn_candidates"):
+    for name in MARCHED:
         if getattr(sizes, name) < 1:
             raise ValueError(f"{CLI}.{name.replace('_', '-')} is {getattr(sizes, name)}, below 1")
+    if not LEAST_BATCH <= sizes.guided_batch < math.inf:
+        raise ValueError(
+            f"{CLI}.guided-batch is {sizes.guided_batch}, not a number of at least {LEAST_BATCH}"
+        )
     if sizes.gate.scene_experts > sizes.field.experts.scene_experts:
         raise ValueError(
             f"the gate sends points to {sizes.gate.scene_experts} scene experts and the field has "
@@ -278,6 +282,9 @@ def _check_field(sizes: Sizes) -> None:
     for name, largest in LARGEST_IN_FIELD.items():
         if type(parts[name]) is not int or not 0 < parts[name] <= largest:
             raise ValueError(f"the field's {name} is {parts[name]!r}, not in 1 to {largest}")
+    for name, least in (("appearance_dim", 0), ("direction_octaves", 0), ("color_width", 1)):
+        if getattr(sizes.field, name) < least:
+            raise ValueError(f"the field's {name} is {getattr(sizes.field, name)}, below {least}")
     if encoding.kind == "hash":
         if encoding.finest < encoding.coarsest:
             raise ValueError(

@@ -26,7 +26,6 @@ from leco_plugin.models.sizing.sizes import (
     from_stored,
     sizes_in,
     sizes_to_resume,
-    stored_in,
     to_store,
     with_size,
 )
@@ -61,7 +60,8 @@ def rendered(model: LecoModel) -> torch.Tensor:
 def test_sizes_come_back_as_they_were(sizes: Sizes) -> None:
     found, images = from_stored(to_store(sizes, 7), SMALL)
     assert (found.gate, found.field, images) == (sizes.gate, sizes.field, 7)
-    assert found.candidates == SMALL.candidates  # no matter of what was built
+    assert (found.candidates, found.learn_candidates) == (sizes.candidates, sizes.learn_candidates)
+    assert found.guided_batch == SMALL.guided_batch  # no matter of what was built
 
 
 def test_sizes_of_a_later_release_are_refused() -> None:
@@ -112,12 +112,6 @@ def test_the_same_sizes_leave_modules_and_config_as_they_are() -> None:
     assert mixture.gate is gate and mixture.field is field and model.config is config
 
 
-def test_a_state_without_sizes_leaves_those_of_now() -> None:
-    now = (TINY, 3)
-    for extra in (None, {}, {"report": {}}):
-        assert stored_in(extra, now) == now
-
-
 def test_a_model_refuses_a_checkpoint_with_sizes_of_a_later_release() -> None:
     state = model_of(TINY).state_dict()
     state["mixture._extra_state"]["sizes"]["field"]["colour_octaves"] = 4
@@ -142,12 +136,15 @@ def test_a_checkpoint_says_its_sizes(tmp_path: Path) -> None:
 
 def test_going_on_fills_what_is_open_and_refuses_another_size() -> None:
     stored = to_store(TINY, 3)
-    wanted = replace(automatic(TINY), candidates=99)
-    assert sizes_to_resume(wanted, stored) == replace(TINY, candidates=99)
+    wanted = replace(automatic(TINY), guided_batch=9.0)
+    assert sizes_to_resume(wanted, stored) == replace(TINY, guided_batch=9.0)
     assert sizes_to_resume(TINY, stored) == TINY
     other = with_size(wanted, "field.encoding.log2_table", 11)
     with pytest.raises(InputError, match=r"log2-table is 11, and the run .* has 8") as caught:
         sizes_to_resume(other, stored)
     assert "\n" not in str(caught.value)
+    for name in ("candidates", "learn-candidates"):  # the steps along rays are found from them
+        with pytest.raises(InputError, match=rf"sizes\.{name} is 99, and the run"):
+            sizes_to_resume(replace(TINY, **{name.replace("-", "_"): 99}), stored)
     with pytest.raises(InputError, match=r"gate\.layers is 3, and the run .* has 1"):
         sizes_to_resume(automatic(SMALL), stored)
