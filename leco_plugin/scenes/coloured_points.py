@@ -85,15 +85,19 @@ def description_in(data: Path) -> Path:
 
 
 def read_cloud(path: Path) -> CloudFile:
-    """The finite vertices of a .ply. InputError if the file cannot be read as points."""
+    """The finite vertices of a .ply, also of a mesh. InputError if it cannot be read as points."""
     import trimesh
 
     try:
         # as a file and not by its name: nothing else is read that it may point to
         with path.open("rb") as file:
-            loaded: Any = trimesh.load(file, file_type="ply")
-        positions = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
-        colours = np.asarray(getattr(loaded, "colors", ()), dtype=np.uint8)
+            loaded: Any = trimesh.load(file, file_type="ply", process=False)
+        is_empty = isinstance(loaded, trimesh.Scene) and not loaded.geometry
+        vertices = () if is_empty else loaded.vertices
+        positions = np.asarray(vertices, dtype=np.float64).reshape(-1, 3)
+        is_mesh = getattr(getattr(loaded, "visual", None), "kind", None) == "vertex"
+        paint = loaded.visual.vertex_colors if is_mesh else getattr(loaded, "colors", ())
+        colours = np.asarray(paint, dtype=np.uint8)
     except Exception as error:  # noqa: BLE001  trimesh raises whatever its parsers meet
         raise InputError(
             f"{path} cannot be read as sparse points: {one_line(error, 120)}"

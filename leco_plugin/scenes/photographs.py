@@ -70,7 +70,10 @@ class LecoPhotographs(CheckedReader, ReadsNear, Nerfstudio):
             self.config.orientation_method = "none"
         outputs: DataparserOutputs = super()._generate_dataparser_outputs(split)
         if len(outputs.image_filenames) == 0 and split == "train":
-            raise InputError(f"{data}: no image is left for the split {split!r}")
+            raise InputError(
+                f"{data}: no image is left for the split {split!r}: list some in train_filenames, "
+                "or remove it"
+            )
         try:
             applied, applied_scale = applied_in(meta, data)
             frame = from_file(parsed_frame(outputs), applied, applied_scale, torch.float64)
@@ -143,8 +146,8 @@ def check_scene(data: Path) -> dict[str, Any]:
 def points_of(meta: dict[str, Any], folder: Path) -> CloudFile | None:
     """Sparse points in the coordinates of the file, or None when there are none.
 
-    A file that is named and not there is said, for learning without points is slower. InputError
-    if it cannot be read.
+    A file that is named and not there, or empty, is said, for learning without points is slower.
+    InputError if it cannot be read.
     """
     name = meta.get("ply_file_path")
     if name is None:
@@ -153,7 +156,11 @@ def points_of(meta: dict[str, Any], folder: Path) -> CloudFile | None:
     if not path.is_file():
         say(f"the scene names sparse points that are not there: {path}")
         return None
-    return read_cloud(path)
+    points = read_cloud(path)
+    if len(points.positions) == 0:
+        say(f"{path} has no points; `leco points` finds some in the photographs")
+        return None
+    return points
 
 
 def points_in_model(points: CloudFile, frame: Tensor) -> dict[str, Tensor]:

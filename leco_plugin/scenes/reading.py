@@ -155,6 +155,8 @@ def _remedy(error: BaseException, config: Any) -> str:
             "it would make smaller copies of photographs of more than 1600 pixels: "
             f"`{command_with(reader, data) or reader}` takes them as they are"
         )
+    if "list of filenames for split" in str(error):
+        return "list photographs in val_filenames and test_filenames too, or remove train_filenames"
     if "camera model" in _reason(error).lower():
         return "undistort the photographs with `colmap image_undistorter`, and give that model"
     if "\\" in str(error).replace("\\\\", "\\"):
@@ -261,7 +263,8 @@ def _size_of(
             return size
     raise InputError(
         f"{path} has {sizes[0][0]} x {sizes[0][1]} pixels, its intrinsics are for "
-        f"{wanted[0]} x {wanted[1]}"
+        f"{wanted[0]} x {wanted[1]}: put photographs of that size there, or scale w, h, fl_x, "
+        "fl_y, cx and cy"
     )
 
 

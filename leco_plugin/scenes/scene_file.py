@@ -58,11 +58,12 @@ def file_in(data: Path) -> Path:
 
 
 def load_json(path: Path) -> Any:
-    """What a JSON file says, with or without a byte order mark; nulls of frames are left out, and
-    poses of three rows have the fourth."""
+    """What a JSON file says, with or without a byte order mark; nulls are left out, and poses
+    of three rows have the fourth."""
     said = _parsed(path.read_bytes())
     if not isinstance(said, dict):
         return said
+    said = _without_nulls(said)
     lists = {name: said[name] for name in FRAMES if isinstance(said.get(name), list)}
     return said | {name: [_completed(frame) for frame in lists[name]] for name in lists}
 
@@ -73,10 +74,14 @@ def _parsed(content: bytes) -> Any:
     return json.loads(content.decode("utf-8-sig"))
 
 
+def _without_nulls(said: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in said.items() if value is not None}
+
+
 def _completed(frame: Any) -> Any:
     if not isinstance(frame, dict):
         return frame
-    frame = {name: value for name, value in frame.items() if value is not None}
+    frame = _without_nulls(frame)
     pose = frame.get("transform_matrix")
     if isinstance(pose, list) and len(pose) == 3:
         frame["transform_matrix"] = [*pose, [0.0, 0.0, 0.0, 1.0]]
@@ -275,6 +280,8 @@ CONVERTERS = {
     "images": "images",
 }
 """What lies in a folder, and which of ns-process-data's commands is for it."""
+BEGIN_WITH = {"*.xml": b"<document", "*.csv": b"#"}
+"""What cameras of Metashape and of RealityCapture hold near their beginning; flight logs do not."""
 METHOD = "leco-occupancy"
 """Named where none was typed."""
 
@@ -319,12 +326,20 @@ def _images_option(folder: Path) -> str:
     return "" if place is None else f" --images-path {shlex.quote(str(place.relative_to(folder)))}"
 
 
+def _is_of(path: Path, mark: bytes | None) -> bool:
+    """Whether a file is of the program that its name tells of, by what it holds."""
+    if mark is None:
+        return True
+    with path.open("rb") as file:
+        return mark in file.read(200)
+
+
 def _converter_for(data: Path) -> str | None:
     """The command that makes a scene of a folder; None where none is known."""
     if not data.is_dir():
         return None
     for sign, kind in CONVERTERS.items():
-        if any(data.glob(sign)):
+        if any(_is_of(path, BEGIN_WITH.get(sign)) for path in data.glob(sign)):
             source = data / "images" if sign == "images" else data
             command, *options = kind.split()
             place = next((each for each in COLMAP if (data / each / "cameras.bin").is_file()), None)

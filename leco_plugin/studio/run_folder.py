@@ -44,10 +44,7 @@ def claim(folder: Path, checkpoints: Path, load_from: Path | None) -> str | None
             folder.mkdir(parents=True, exist_ok=True)
             held = lock(folder)
         except OSError as error:
-            raise InputError(
-                f"nothing can be written into {folder} ({error.strerror or one_line(error)}): name "
-                "another folder with --output-dir"
-            ) from None
+            raise unwritable(folder, error) from None
         if held is None:
             return f"another run is going on in {folder}"
         if not _held:
@@ -59,6 +56,14 @@ def claim(folder: Path, checkpoints: Path, load_from: Path | None) -> str | None
         release(folder)
         return f"{folder} holds an earlier run, with which this one does not go on"
     return None
+
+
+def unwritable(folder: Path, error: OSError) -> InputError:
+    """What says in one line that a run cannot have its folder."""
+    return InputError(
+        f"nothing can be written into {folder} ({error.strerror or one_line(error)}): name another "
+        "folder with --output-dir"
+    )
 
 
 def release(folder: Path) -> None:
@@ -113,7 +118,10 @@ def keep_sizes(config: Any, model: Any, asked: Any) -> Any:
     path = config.get_base_dir() / CONFIG
     if is_first() and path.exists():  # what is not to be stored has none
         text = yaml.dump(config)
-        write_whole(path, lambda file: file.write(text.encode("utf8")))
+        try:
+            write_whole(path, lambda file: file.write(text.encode("utf8")))
+        except OSError as error:
+            raise unwritable(path.parent, error) from None
     return config
 
 

@@ -16,6 +16,7 @@ import trimesh
 from PIL import Image
 from scene_files import change, refused
 
+from leco_plugin.scenes.coloured_points import read_cloud
 from leco_plugin.scenes.frames import METRES_PER_UNIT, data_frame_of, inverse, moved, parsed_frame
 from leco_plugin.scenes.photographs import (
     POINTS,
@@ -26,6 +27,8 @@ from leco_plugin.scenes.photographs import (
     taken_from_above,
 )
 from leco_plugin.scenes.whole_files import write_points
+
+LISTS = ("train_filenames", "val_filenames", "test_filenames")
 
 
 def set_pose(value: Any) -> Callable[[dict[str, Any]], None]:
@@ -99,7 +102,7 @@ BAD_MEASURES: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "an image of another size": (
         lambda s: Image.new("RGB", (16, 31)).save(s / "images" / "003.png"),
-        "003.png has 16 x 31 pixels, its intrinsics are for 32 x 32",
+        "003.png has 16 x 31 pixels, its intrinsics are for 32 x 32: put photographs of that size",
     ),
     "no image size": (lambda s: change(s, lambda m: m.pop("w")), "000.png has no w"),
     "no principal point": (lambda s: change(s, lambda m: m.pop("cx")), "000.png has no cx"),
@@ -234,6 +237,53 @@ def test_a_scene_without_points_has_none_and_missing_ones_are_said(
     assert "[of]/nowhere.ply" in "".join(said.split())  # wherever the line was broken
 
 
+@pytest.mark.parametrize("format", ["ascii", "binary_little_endian"])
+def test_a_file_with_no_points_is_a_scene_without_them(
+    format: str, scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    text = f"ply\nformat {format} 1.0\nelement vertex 0\n{axes}end_header\n"
+    (scene / "none.ply").write_text(text)
+    assert read_points({"ply_file_path": "none.ply"}, scene) is None
+    assert "points; `leco points` finds some" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_mesh_gives_all_its_vertices_and_their_colours(scene: Path) -> None:
+    positions, colours = (
+        np.random.default_rng(0).random((5, 3)),
+        np.arange(15, dtype=np.uint8).reshape(5, 3),
+    )
+    mesh = trimesh.Trimesh(positions, [[0, 1, 2]], vertex_colors=colours, process=False)
+    mesh.export(scene / "mesh.ply")
+    found = read_cloud(scene / "mesh.ply")
+    np.testing.assert_allclose(found.positions, positions, atol=1e-6)
+    np.testing.assert_array_equal(found.colours, colours)
+
+
+@pytest.mark.parametrize(
+    "name", ["applied_transform", "k1", "camera_model", "orientation_override"]
+)
+def test_nulls_of_a_scene_are_as_if_they_were_not_there(name: str, scene: Path) -> None:
+    expected = outputs_of(scene)
+    change(scene, lambda meta: meta.update({name: None}))
+    found = outputs_of(scene)
+    assert found.image_filenames == expected.image_filenames
+    assert torch.equal(found.cameras.camera_to_worlds, expected.cameras.camera_to_worlds)
+    change(scene, lambda meta: meta.update(dict.fromkeys(LISTS)))
+    assert len(outputs_of(scene).image_filenames) > 0
+
+
+def test_lists_that_leave_nothing_say_what_to_do(scene: Path) -> None:
+    change(scene, lambda meta: meta.update(train_filenames=[]))
+    with refused("no image is left .*: list some in train_filenames, or remove it"):
+        outputs_of(scene)
+    meta = change(scene, lambda meta: meta.update(dict.fromkeys(LISTS)))
+    some = [frame["file_path"] for frame in meta["frames"][:5]]
+    change(scene, lambda meta: meta.update(train_filenames=some))
+    with refused("list photographs in val_filenames and test_filenames too"):
+        outputs_of(scene, "val")
+
+
 def test_only_cameras_that_look_down_are_above() -> None:
     down = np.tile(np.eye(4), (8, 1, 1))  # a camera looks along its -z
     across = down.copy()
@@ -246,7 +296,9 @@ def test_a_scene_may_say_how_many_metres_a_unit_of_its_poses_is(scene: Path) -> 
     assert METRES_PER_UNIT not in outputs_of(scene).metadata
     change(scene, lambda meta: meta.update(metres_per_unit=2))
     assert outputs_of(scene).metadata[METRES_PER_UNIT] == 2.0
-    for wrong in (0, -1.0, "one", None):
+    change(scene, lambda meta: meta.update(metres_per_unit=None))  # as if it were not there
+    assert METRES_PER_UNIT not in outputs_of(scene).metadata
+    for wrong in (0, -1.0, "one", []):
         change(scene, lambda meta, wrong=wrong: meta.update(metres_per_unit=wrong))
         with refused("metres_per_unit"):
             outputs_of(scene)

@@ -328,6 +328,14 @@ def test_a_folder_of_another_reader_names_it(scene: Path, tmp_path: Path) -> Non
         (folder / sign).parent.mkdir(parents=True)
         (folder / sign).write_text("{}")
         assert wanted in str(remedy_for(folder))
+    for name, begin, wanted in (
+        ("flight.csv", "time,latitude", "leco poses"),
+        ("mission.xml", "<?xml?><kml>", "leco poses"),
+        ("cameras.csv", "#name,x,y", "ns-process-data realitycapture"),
+        ("cameras.xml", "<?xml?>\n<document", "ns-process-data metashape"),
+    ):
+        (folder / name).write_text(begin)
+        assert wanted in str(remedy_for(folder)), name
     assert remedy_for(tmp_path / "nowhere" / "at" / "all") is None
     (tmp_path / "begun" / "colmap").mkdir(parents=True)
     (tmp_path / "begun" / "images").mkdir()

@@ -98,6 +98,19 @@ def test_a_folder_in_which_nothing_can_be_written_is_said_in_one_line(folder: Pa
         claim(beneath, beneath / "checkpoints", None)
 
 
+def test_a_full_disk_is_said_in_one_line_before_the_run(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> int:
+        raise OSError(28, "No space left on device")
+
+    config = copy.deepcopy(leco_occupancy.config)
+    config.output_dir, config.experiment_name, config.timestamp = folder, "one", "now"
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(InputError, match=r"nothing can be written into .*No space left.*another"):
+        config.save_config()
+
+
 def test_a_new_run_does_not_take_a_folder_with_checkpoints(folder: Path) -> None:
     checkpoints = folder / "checkpoints"
     checkpoints.mkdir(parents=True)

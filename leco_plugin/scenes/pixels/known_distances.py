@@ -71,19 +71,22 @@ def _at_most(most: int, rows: Tensor) -> Tensor:
 
 def project(cameras: Cameras, number: int, points: Tensor) -> tuple[Tensor, Tensor]:
     """Image places of points [P, 2] (row, column; whole numbers are the upper left corners of
-    pixels), and their distances [P], scene units, negative behind the camera.
+    pixels), and their distances [P], scene units, negative where the camera does not see them:
+    behind it, or so far outside that the formula of its lens folds them back into the image.
     """
     pose = cameras.camera_to_worlds[number]
     local = (points - pose[:, 3]) @ pose[:, :3]
     ahead = -local[:, 2]
     x, y = (local[:, :2] / ahead.clamp(min=1e-9)[:, None]).unbind(dim=-1)
-    y = -y
+    y, seen = -y, ahead > 0
     if cameras.distortion_params is not None:
-        x, y = distort(x, y, cameras.distortion_params[number])
+        params = cameras.distortion_params[number]
+        seen = seen & ~is_folded(x, y, params)
+        x, y = distort(x, y, params)
     rows = cameras.cy[number] + cameras.fy[number] * y
     columns = cameras.cx[number] + cameras.fx[number] * x
     lengths = local.norm(dim=-1)
-    return torch.stack([rows, columns], dim=-1), torch.where(ahead > 0, lengths, -lengths)
+    return torch.stack([rows, columns], dim=-1), torch.where(seen, lengths, -lengths)
 
 
 def distort(x: Tensor, y: Tensor, params: Tensor) -> tuple[Tensor, Tensor]:
@@ -96,6 +99,15 @@ def distort(x: Tensor, y: Tensor, params: Tensor) -> tuple[Tensor, Tensor]:
     bent_y = y * radial + 2.0 * p2 * x * y + p1 * (r + 2.0 * y * y)
     near = r < 4.0
     return torch.where(near, bent_x, x), torch.where(near, bent_y, y)
+
+
+def is_folded(x: Tensor, y: Tensor, params: Tensor) -> Tensor:
+    """Whether radial distortion has stopped to grow somewhere between the centre and normalised
+    image places; beyond, two places share a pixel. Bool, of the places' shape."""
+    powers = torch.arange(1, 5)
+    squares = (x * x + y * y)[..., None, None] * torch.linspace(0.05, 1.0, 20)[:, None]
+    slopes = 1.0 + ((2 * powers + 1) * params[:4] * squares**powers).sum(dim=-1)
+    return (slopes <= 0.0).any(dim=-1)
 
 
 def hidden(pixels: Tensor, lengths: Tensor, height: int, width: int) -> Tensor:

@@ -171,3 +171,16 @@ def test_a_pixel_is_looked_up_in_the_mask_of_its_own_image() -> None:
     made.sparse = SparsePixels(torch.tensor([[6, 15, 25], [8, 15, 25]]), torch.tensor([1.0, 2.0]))
     pixels = made.sample(batch)
     assert set(pixels[DISTANCE].tolist()) == {0.0, 2.0}
+
+
+@pytest.mark.parametrize("k1", [0.05, -0.15, -0.25, -0.4])
+def test_points_that_a_lens_folds_back_into_the_image_have_no_distance(k1: float) -> None:
+    made = cameras([k1, 0.0, 0.0, 0.0, 0.0, 0.0])
+    places = torch.rand(20_000, 2, generator=torch.Generator().manual_seed(0)) * 80 - 40
+    found = sparse_pixels(made, torch.cat([places, torch.zeros(20_000, 1)], dim=-1), Lattice())
+    assert len(found.distances) > 100
+    for image in (0, 1):
+        mine = found.indices[:, 0] == image
+        rays = made.generate_rays(camera_indices=image, coords=found.indices[mine, 1:] + 0.5)
+        to_ground = -rays.origins[:, 2] / rays.directions[:, 2]
+        torch.testing.assert_close(found.distances[mine], to_ground, rtol=0.05, atol=0.0)
