@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -62,6 +63,12 @@ def _texture(x: Array, y: Array, seed: int) -> Array:
         )
         total += ((1 - b) * near + b * far) / 4
     return np.clip(0.5 + 1.6 * (total - 0.5), 0.0, 1.0)
+
+
+def odd_exif(tag: tuple[int, int, int, bytes], orientation: int = 6) -> bytes:
+    """EXIF with an orientation and one tag: its number, type, count and 4 bytes of value."""
+    entries = struct.pack("<HHIHH", 0x112, 3, 1, orientation, 0) + struct.pack("<HHI4s", *tag)
+    return b"Exif\0\0II*\0" + struct.pack("<IH", 8, 2) + entries + bytes(4)
 
 
 def exif_of(place: Sequence[float] | None, second: int = 0) -> Image.Exif:

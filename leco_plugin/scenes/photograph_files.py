@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ExifTags, Image, ImageOps
+from PIL import ExifTags, Image
 
 from leco_plugin.log import say
 from leco_plugin.scenes.input_error import InputError, one_line
@@ -30,6 +30,16 @@ CONVERTED = ("1", "P", "PA", "LA", "CMYK")
 """Modes that become one of these; of CMYK by Pillow's formula, without a colour profile."""
 SAVE_ANEW = "if the file is whole, save it as JPEG or PNG with 8 bits a channel, and give that name"
 """What to do about HEIC, OpenEXR and other kinds that Pillow does not read."""
+TURNS = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+"""What sets an image upright, by EXIF's orientation."""
 ANOTHER_FOLDER = "give another folder for derived pictures with --cache"
 
 
@@ -148,11 +158,14 @@ def is_turned(header: Header, size: tuple[int, int]) -> bool:
 
 
 def decode(path: Path, turn: bool) -> Image.Image:
-    """The plain colours of an image, turned as EXIF says if asked. InputError if it has none."""
+    """The plain colours of an image, turned as EXIF says if asked; its EXIF stays as it was.
+    InputError if it has none."""
     try:
         with opened(path) as image:
-            turned = ImageOps.exif_transpose(image) if turn else image
-            return plain(turned).copy()
+            image.load()  # Pillow itself turns TIFF here
+            # Pillow's exif_transpose writes all EXIF anew, and fails at tags of another type
+            turning = TURNS.get(_orientation(image)) if turn else None
+            return plain(image if turning is None else image.transpose(turning)).copy()
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         reason = one_line(error, 120)
     raise InputError(f"{path} cannot be read ({reason}): is the file whole?")

@@ -8,7 +8,8 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageOps
+from rendered_survey import odd_exif
 from scene_files import refused
 
 from leco_plugin.scenes.photograph_files import (
@@ -83,6 +84,22 @@ def test_modes_that_nerfstudio_takes_for_others_are_converted(
     np.testing.assert_array_equal(
         np.asarray(found.convert("RGBA" if plain == "RGBA" else "RGB")), expected
     )
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_an_image_is_turned_as_exif_says_whatever_else_that_says(
+    orientation: int, tmp_path: Path
+) -> None:
+    """With a resolution as text, which Pillow cannot write."""
+    path = write(tmp_path / "a.png", "RGB")
+    sound = Image.Exif()
+    sound[0x112] = orientation
+    with Image.open(path) as image:
+        image.save(path, exif=sound)
+    with Image.open(path) as image:
+        wanted = np.asarray(ImageOps.exif_transpose(image))
+        image.save(path, exif=odd_exif((0x11A, 2, 4, b"300\0"), orientation=orientation))
+    np.testing.assert_array_equal(np.asarray(decode(path, turn=True)), wanted)
 
 
 @pytest.mark.parametrize("mode", ["L", "RGB", "RGBA"])

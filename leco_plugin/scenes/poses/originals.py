@@ -94,13 +94,14 @@ def _position(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
 
 
 def _degrees(parts: Any, reference: Any) -> float:
-    """Degrees of three parts; nan where they are none."""
-    if not isinstance(parts, tuple) or len(parts) != 3:
+    """Degrees of two or three parts; nan where they are none. Blank minutes and seconds are 0."""
+    if not isinstance(parts, tuple) or len(parts) not in (2, 3):
         return math.nan
-    degrees, minutes, seconds = (_number(part, math.nan) for part in parts)
-    total = degrees + minutes / 60.0 + seconds / 3600.0
+    signed = [_number(parts[0], math.nan), *(_number(part) for part in parts[1:])]
+    total = sum(abs(part) / 60.0**power for power, part in enumerate(signed))
     named = reference.decode("ascii", "replace") if isinstance(reference, bytes) else str(reference)
-    return -total if named.strip("\0 ").upper()[:1] in ("S", "W") else total
+    is_negative = named.strip("\0 ").upper()[:1] in ("S", "W") or min(signed) < 0.0
+    return -total if is_negative else total
 
 
 def _time(details: Mapping[int, Any]) -> float | None:
@@ -138,6 +139,8 @@ LONGEST = 80
 """Letters of a copy's name, its last ones: of 255 bytes that one may have, each takes up to 3."""
 QUALITY = 95
 """Of a JPEG that is written anew."""
+MOST_EXIF = 65_533
+"""Bytes of EXIF that a JPEG can hold."""
 
 
 @dataclass(frozen=True)
@@ -206,12 +209,7 @@ def find_photographs(folder: Path, out: Path) -> Found:
         raise InputError(f"there is no folder {folder}: give the one with the photographs")
     if folder.is_relative_to(out):
         raise InputError(f"--out {out} holds the photographs: give a folder beside them")
-    files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
-    files = [path for path in files if not path.is_relative_to(out)]
-    # thumbnails and previews of other programs lie in hidden folders
-    files = [
-        path for path in files if all(part[0] != "." for part in path.relative_to(folder).parts)
-    ]
+    files = _files_below(folder, out)
     found = [path for path in files if path.suffix.lower() in KINDS]
     if len(found) < FEWEST:
         number = f"{len(found) or 'no'} photograph{'' if len(found) == 1 else 's'}"
@@ -238,6 +236,26 @@ def find_photographs(folder: Path, out: Path) -> Found:
             for number, each in enumerate(photographs)
         ]
     return _enough(Found(photographs, refused))
+
+
+def _files_below(folder: Path, out: Path) -> list[Path]:
+    """Files in a folder and below it, by name, each folder once; what is hidden or lies in `out` is
+    left out."""
+    found: list[Path] = []
+    known = set()
+    starts = [folder]  # linked folders follow, so that a folder is known by its own name first
+    for start in starts:
+        for place, folders, names in os.walk(start):
+            here, real = Path(place), Path(place).resolve()
+            # thumbnails and previews of other programs lie in hidden folders
+            folders[:] = sorted(name for name in folders if name[0] != ".")
+            if real in known or real.is_relative_to(out.resolve()):
+                folders.clear()
+                continue
+            known.add(real)
+            starts += [here / name for name in folders if (here / name).is_symlink()]
+            found += [here / name for name in names if name[0] != "."]
+    return sorted(path for path in found if path.is_file())
 
 
 def _enough(found: Found) -> Found:
@@ -320,9 +338,22 @@ def _write(photograph: Photograph, image: Image.Image, path: Path) -> None:
                 write_whole(path, lambda file: shutil.copyfileobj(source, file))
         else:
             kind = "PNG" if path.suffix.lower() == ".png" else "JPEG"
-            exif = image.getexif()
-            exif[0x0112] = 1  # upright from here on
+            exif = _upright_exif(image, kind)
             options = {} if kind == "PNG" else {"quality": QUALITY, "subsampling": 0}
             write_whole(path, lambda file: image.save(file, kind, exif=exif, **options))
     except OSError as error:
         raise InputError(f"{path} cannot be written: {one_line(error, 120)}") from None
+
+
+def _upright_exif(image: Image.Image, kind: str) -> bytes:
+    """EXIF of an image that has been turned upright. Where it cannot be written, or is too long for
+    a JPEG, it says nothing but that the image is upright."""
+    upright = Image.Exif()
+    upright[ExifTags.Base.Orientation] = 1
+    try:
+        exif = image.getexif()
+        exif[ExifTags.Base.Orientation] = 1
+        said = exif.tobytes()
+    except Exception:  # noqa: BLE001  tags of another type than the standard's raise many errors
+        return upright.tobytes()
+    return upright.tobytes() if kind == "JPEG" and len(said) > MOST_EXIF else said

@@ -7,9 +7,10 @@ import math
 
 import pytest
 from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 from rendered_survey import FOCAL, ORIGIN, exif_of
 
-from leco_plugin.scenes.poses.originals import Exif, focal_length, read_exif
+from leco_plugin.scenes.poses.originals import Exif, _position, focal_length, read_exif
 
 
 def read(exif: Image.Exif, size: tuple[int, int] = (320, 240)) -> Exif:
@@ -49,6 +50,31 @@ def test_a_position_is_of_the_globe_or_none(
     assert (found is None) == (wanted is None)
     if found is not None:
         assert found[:2] == pytest.approx(wanted) and math.isnan(found[2])
+
+
+@pytest.mark.parametrize(
+    ("parts", "reference"),
+    [
+        (((33, 1), (51.5, 1), (0, 0)), "S"),
+        (((33, 1), (51.5, 1)), "S"),
+        (((33.858333, 1), (0, 0), (0, 0)), "S"),
+        (((-33, 1), (51, 1), (30, 1)), None),
+        (((-33, 1), (-51, 1), (-30, 1)), None),
+        (((-33, 1), (51, 1), (30, 1)), "S"),
+    ],
+    ids=["blank seconds", "two parts", "degrees alone", "signed", "all signed", "signed and named"],
+)
+def test_parts_that_are_blank_are_zero_and_a_sign_is_of_all_parts(
+    parts: tuple[tuple[float, int], ...], reference: str | None
+) -> None:
+    gps = {2: tuple(IFDRational(*part) for part in parts), 3: "E", 4: (1.0, 0.0, 0.0)}
+    position = _position(gps | ({} if reference is None else {1: reference}))
+    assert position is not None and position[0] == pytest.approx(-33.858333, abs=1e-6)
+
+
+@pytest.mark.parametrize("degrees", [IFDRational(0, 0), "wide"])
+def test_a_position_without_degrees_is_none(degrees: object) -> None:
+    assert _position({2: (degrees, 30.0, 0.0), 4: (1.0, 0.0, 0.0)}) is None
 
 
 def test_an_altitude_may_be_below_the_sea() -> None:

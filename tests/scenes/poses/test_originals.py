@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import struct
 import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
-from rendered_survey import exif_of
+from rendered_survey import exif_of, odd_exif
 
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.poses.originals import copy_photographs, find_photographs
@@ -56,6 +57,38 @@ def test_a_turned_photograph_is_copied_upright_with_its_exif(folder: Path, tmp_p
     assert np.abs(np.asarray(copy, dtype=float) - upright).mean() < 20.0
     again = find_photographs(tmp_path / "out" / "images", tmp_path / "x").photographs
     assert [each.exif.position for each in again][3] == found["IMG_3.jpg"].exif.position
+
+
+GPS_BEGINS = 8 + 2 + 2 * 12 + 4
+"""Offset of what follows a folder of two tags: orientation, and where GPS is."""
+
+
+@pytest.mark.parametrize(
+    "exif",
+    [
+        odd_exif((0x11A, 2, 4, b"300\0")),
+        odd_exif((0x128, 2, 3, b"in\0\0")),
+        odd_exif((0x100, 9, 1, struct.pack("<i", -1))),
+        *(
+            odd_exif((0x8825, 4, 1, struct.pack("<I", GPS_BEGINS)))
+            + struct.pack("<HHHI4sI", 1, tag, kind, count, value, 0)
+            + struct.pack("<ii", -33, 1)
+            for tag, kind, count, value in (
+                (0, 2, 4, b"2.3\0"),
+                (5, 2, 2, b"0\0\0\0"),
+                (2, 10, 1, struct.pack("<I", GPS_BEGINS + 18)),
+            )
+        ),
+    ],
+    ids=["resolution", "unit", "width", "version of GPS", "reference of altitude", "degrees"],
+)
+def test_a_photograph_whose_exif_cannot_be_written_anew_is_turned(
+    exif: bytes, folder: Path, tmp_path: Path
+) -> None:
+    with Image.open(folder / "IMG_2.jpg") as image:
+        image.save(folder / "IMG_2.jpg", exif=exif)
+    copy = copies(folder, tmp_path / "out")["IMG_2.jpg"]
+    assert copy.size == (24, 32) and copy.getexif()[0x0112] == 1
 
 
 @pytest.mark.parametrize("mode", ["L", "LA", "P", "1", "CMYK"])
@@ -110,6 +143,21 @@ def test_thumbnails_in_hidden_folders_are_left_aside(folder: Path, tmp_path: Pat
     (hidden / "IMG_0.jpg").write_bytes((folder / "IMG_0.jpg").read_bytes())
     (folder / "._IMG_0.jpg").write_bytes(b"of another system")
     assert len(find_photographs(folder, tmp_path / "out").photographs) == 3
+
+
+def test_photographs_in_linked_folders_are_found_once(folder: Path, tmp_path: Path) -> None:
+    day = tmp_path / "day"
+    day.mkdir()
+    (folder / "IMG_2.jpg").rename(day / "IMG_2.jpg")
+    (day / "back").symlink_to(folder)
+    (folder / "day").symlink_to(day)
+    (folder / "z").mkdir()
+    (folder / "IMG_1.jpg").rename(folder / "z" / "IMG_1.jpg")
+    (folder / "a").symlink_to(folder / "z")
+    copies(folder, tmp_path / "out")
+    (folder / "out").symlink_to(tmp_path / "out")
+    names = [each.name for each in find_photographs(folder, tmp_path / "out").photographs]
+    assert names == ["IMG_0.jpg", "day_IMG_2.jpg", "z_IMG_1.jpg"]
 
 
 def test_photographs_of_one_lens_and_size_share_it(folder: Path, tmp_path: Path) -> None:
@@ -270,6 +318,17 @@ def test_a_picture_larger_than_pillow_opens_is_named_with_its_reason(
     Image.new("RGB", (64, 25)).save(folder / "IMG_7.jpg")
     (why,) = find_photographs(folder, tmp_path / "out").refused.values()
     assert "IMG_7.jpg has more than the 0 megapixels that Pillow opens: make it smaller" in why
+
+
+def test_exif_that_is_too_long_for_a_jpeg_is_left_out(folder: Path, tmp_path: Path) -> None:
+    pillow_heif = pytest.importorskip("pillow_heif")
+    pillow_heif.register_heif_opener()
+    exif = exif_of((1.0, 2.0, 3.0))
+    exif[0x010E] = "a" * 70_000
+    with Image.open(folder / "IMG_0.jpg") as image:
+        image.save(folder / "IMG_3.HEIC", exif=exif)
+    copy = copies(folder, tmp_path / "out")["IMG_3.HEIC.jpg"]
+    assert dict(copy.getexif()) == {0x0112: 1}
 
 
 def test_heic_is_copied_as_jpeg(folder: Path, tmp_path: Path) -> None:
