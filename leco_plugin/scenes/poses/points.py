@@ -17,6 +17,7 @@ from nerfstudio.cameras.cameras import CameraType
 from numpy.typing import NDArray
 from PIL import Image
 
+from leco_plugin.evaluation.report import usable_cores
 from leco_plugin.log import bar
 from leco_plugin.scenes.bounds import FEWEST_POINTS
 from leco_plugin.scenes.input_error import InputError, require
@@ -24,6 +25,7 @@ from leco_plugin.scenes.lenses import DISTORTIONS, Lens
 from leco_plugin.scenes.photograph_files import (
     check_images,
     decode,
+    find_file,
     header_of,
     is_turned,
     seen_pixels,
@@ -34,9 +36,9 @@ from leco_plugin.scenes.poses.originals import FEWEST, Exif, Photograph
 from leco_plugin.scenes.poses.reconstruction import (
     MASKS,
     Reconstructor,
-    available_threads,
     choose_posed_pairs,
     load_pycolmap,
+    require_disk,
 )
 from leco_plugin.scenes.scene_file import SceneFile, scene_file_of
 from leco_plugin.scenes.whole_files import check_place, write_json, write_whole
@@ -46,6 +48,8 @@ FILE, BEFORE = "leco_points.ply", "transforms.before_points.json"
 """The points, and transforms.json as it was, in the folder of the scene."""
 TOLERANCE = 0.01
 """Share of a picture's longest side by which a feature may miss its point; COLMAP has 4 pixels."""
+BYTES_A_SQUARE = 2.0
+"""Of a copy as PNG, over the square of its longest side: four scenes took 0.9 to 1.2."""
 CONTRADICTED = 0.5
 """Share of the matched features that must agree with the poses: 94% do in a scene of nine
 photographs, 12 to 15% where their poses are shuffled."""
@@ -78,8 +82,9 @@ def find_points(data: Path, size: int = 1600, threads: int = 0) -> dict[str, Any
     centre = poses[:, :, 3].mean(axis=0)  # pycolmap loses digits of coordinates like UTM's
     poses[:, :, 3] -= centre
     with tempfile.TemporaryDirectory() as work:
+        require_disk(Path(work), len(chosen), _bytes_of_copies(scene, chosen, size), "TMPDIR")
         photographs, cameras = _copies(scene, chosen, Path(work) / "images", size)
-        reconstructor = Reconstructor(Path(work), photographs, threads or available_threads())
+        reconstructor = Reconstructor(Path(work), photographs, threads or usable_cores())
         reconstructor.folder.mkdir()
         reconstructor.extract("perspective", size)
         model = _triangulate(reconstructor, cameras, poses)
@@ -97,8 +102,9 @@ def training_frames(scene: SceneFile) -> list[int]:
     every = range(len(scene.meta["frames"]))  # ScanNet++ lists its test frames after these
     if not listed:
         return list(every)
-    wanted = {str(name) for name in listed}
-    return [number for number in every if scene.frames[number]["file_path"] in wanted]
+    wanted = {find_file(scene.folder / str(name)) for name in listed}
+    pictures = scene.pictures()
+    return [number for number in every if pictures[number] in wanted]
 
 
 def _triangulate(reconstructor: Reconstructor, cameras: Sequence[Any], poses: Array) -> Any:
@@ -159,6 +165,13 @@ def _refuse_few(model: Any, matched: int, path: Path) -> None:
         f"only {agreeing} of {matched} features that the photographs share agree with the poses "
         f"in {path}: those are of other photographs, or their lenses are; `leco poses` makes both"
     )
+
+
+def _bytes_of_copies(scene: SceneFile, chosen: Sequence[int], size: int) -> float:
+    """Of disk that copies with a longest side of `size` pixels take, about."""
+    pictures = scene.pictures()
+    sides = [min(size, max(header_of(pictures[number]).size)) for number in chosen]
+    return sum(BYTES_A_SQUARE * side**2 for side in sides)
 
 
 def _copies(

@@ -354,3 +354,30 @@ def test_a_disk_that_is_too_full_is_said_before_the_work(
     monkeypatch.setattr("leco_plugin.scenes.poses.command.shutil.disk_usage", lambda _: full)
     with pytest.raises(InputError, match="3 MB are free on its disk, and 13 are needed: free some"):
         make_scene(photos, tmp_path / "out")
+
+
+def test_disk_is_counted_for_copies_that_are_larger_than_their_originals(
+    pycolmap: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three turned photographs are written anew."""
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for number in range(3):
+        noise = np.random.default_rng(number).integers(0, 255, (600, 800, 3), dtype=np.uint8)
+        Image.fromarray(noise).save(folder / f"{number}.jpg", exif=exif)
+    size = sum(path.stat().st_size for path in folder.iterdir())
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=3e6 + 2 * size))
+    with pytest.raises(InputError, match=f"and {(3e6 + 3 * size) / 1e6:.0f} are needed"):
+        make_scene(folder, tmp_path / "out")
+
+
+def test_a_disk_that_copies_have_filled_is_said_before_features_are_sought(
+    pycolmap: Any, photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free = iter((1e9, 3e6))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=next(free)))
+    monkeypatch.setattr(pycolmap, "import_images", None)
+    with pytest.raises(InputError, match="3 MB are free on its disk, and 12 are needed"):
+        make_scene(photos, tmp_path / "out")

@@ -21,6 +21,7 @@ from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.lenses import lens_of
 from leco_plugin.scenes.poses.points import BEFORE, FILE, camera_of, find_points, training_frames
 from leco_plugin.scenes.poses.reconstruction import FEW, choose_posed_pairs
+from leco_plugin.scenes.scene_file import SceneFile
 
 FAR_AWAY = np.array([500_000.0, 4_600_000.0, 0.0])
 """Metres, as UTM has them."""
@@ -113,10 +114,32 @@ def test_photographs_that_share_too_little_are_refused(pycolmap: Any, tiny_scene
 
 def test_photographs_for_tests_are_left_out() -> None:
     frames = [{"file_path": f"{number}.jpg"} for number in range(4)]
-    scene: Any = SimpleNamespace(meta={"frames": frames[:3]}, frames=frames)
+    scene = SceneFile(Path("scene"), {"frames": frames[:3]}, frames, [], Path())
     assert training_frames(scene) == [0, 1, 2]  # the last is one of ScanNet++'s test frames
     scene.meta["train_filenames"] = ["2.jpg", "0.jpg"]
     assert training_frames(scene) == [0, 2]
+
+
+def test_photographs_for_training_are_known_by_any_name_that_the_reader_takes(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "images").mkdir()
+    for name in "abcd":
+        (tmp_path / "images" / f"{name}.png").touch()
+    frames = [{"file_path": f"images/{name}"} for name in ("a.png", "b", "c.png", "d.png")]
+    listed = ["./images/a.png", "images/b.png", "images\\c.png"]
+    meta = {"frames": frames, "train_filenames": listed}
+    scene = SceneFile(tmp_path / "transforms.json", meta, frames, [], tmp_path)
+    assert training_frames(scene) == [0, 1, 2]
+
+
+def test_a_disk_that_is_too_full_for_copies_is_said_before_the_work(
+    pycolmap: Any, tiny_scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=1e6))
+    monkeypatch.setattr("leco_plugin.scenes.poses.points._copies", None)
+    with pytest.raises(InputError, match=r"TMPDIR .*: 1 MB are free on its disk, and \d+ are need"):
+        find_points(tiny_scene)
 
 
 def test_a_camera_is_scaled_with_its_copy(pycolmap: Any) -> None:

@@ -11,6 +11,7 @@ import pytest
 from rendered_survey import write_survey
 
 from leco_plugin import cli
+from leco_plugin.evaluation.report import usable_cores
 from leco_plugin.scenes.poses import reconstruction
 
 pytestmark = pytest.mark.xdist_group("poses")
@@ -52,4 +53,4 @@ def test_an_old_pycolmap_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_threads_are_those_that_the_process_may_use() -> None:
-    assert reconstruction.available_threads() >= 1
+    assert usable_cores() >= 1
