@@ -9,8 +9,9 @@ changes for a whole process, beside random seeds of `leco shrink`, `leco capacit
   traceback for what a user can mend | the process ends |
 | a filter of warnings, in `ns-train` of a method of ours | `commands`, for `scenes.city_dataparser`
   | torch has renamed what nerfstudio decorates its activations with | the process ends |
-| the file of nerfstudio's console and of rich's, filters of warnings | `run_progress`, for `trainer` and
-  `processes` | what nobody acts on goes to a run's log file | a run is set up, trained, or over |
+| the file of nerfstudio's console and of rich's, filters of warnings | `run_progress`, for
+  `trainer` and `processes` | what nobody acts on goes to a run's log file | a run is set up,
+  trained, or over |
 | `torch.serialization.add_safe_globals` | `checkpoints` | torch 2.6 refuses the numpy scalars in
   nerfstudio's checkpoints | the process ends: nerfstudio may load again at any time |
 | `eval_load_checkpoint` of nerfstudio | `checkpoints` | damaged checkpoints, moved runs | the
@@ -38,7 +39,7 @@ changes for a whole process, beside random seeds of `leco shrink`, `leco capacit
 Instances are changed too, each for as long as it lasts: a model's hash encodings are replaced by
 fast ones (`hash_encoding`), and a data manager's reader is a checked one (`scenes.reading`).
 
-Names that nerfstudio 1.1.5 keeps to itself are read in this folder alone (`trainer`, `viewer`, `checkpoints` and others).
+Names that nerfstudio 1.1.5 keeps to itself are read in this folder alone.
 Methods with such names that its own subclasses override, as `_generate_dataparser_outputs` of a
 reader or `_get_pixel_sampler` of a data manager, are overridden where the subclass is.
 """
