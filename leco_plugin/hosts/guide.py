@@ -25,6 +25,7 @@ from leco_plugin.samplers.registry import (
     OURS,
     SamplerSpec,
     build_estimator,
+    has_option,
     refuse_unknown_options,
     sampler_spec,
 )
@@ -176,18 +177,27 @@ class Guide(nn.Module):
         self,
         aabb: Tensor | None,
         outermost: Tensor | None = None,
+        levels: int = 1,
     ) -> nn.Module:
         """What goes where a packed host has its estimator.
 
         Args:
             aabb: box of that estimator, [6]; None where the host cuts its rays itself.
-            outermost: the box in which the host's own samples at all, [6]; None is no such box.
+            outermost: the box in which the host's own samples at all, [6]; None is `aabb`. In an
+                unbounded scene, rays whose steps do not grow end there.
+            levels: nested boxes of that estimator, each twice as wide as the one before. A sampler
+                with an option `levels` has as many, unless its options set it.
         Raises:
             InputError: the sampler has no estimator, or not all of its options.
         """
         if self._spec("estimator").needs_occupancy:
-            return GuidedEstimator(self, aabb, outermost)
-        return self.built(build_estimator, aabb=aabb, occupancy=None)
+            return GuidedEstimator(self, aabb, aabb if outermost is None else outermost)
+
+        def build(name: str, **options: Any) -> nn.Module:
+            boxes = {"levels": levels} if has_option(name, "estimator", "levels") else {}
+            return build_estimator(name, **boxes | options)
+
+        return self.built(build, aabb=aabb, occupancy=None)
 
     def built(self, build: Callable[..., nn.Module], **given: Any) -> nn.Module:
         """The sampler that the registry builds of what this host gives, with its options.

@@ -127,7 +127,7 @@ def _swap_packed(host: Model, guide: Guide) -> None:
     for old in _estimators(host):
         boxes: Any = old.aabbs
         # of nested boxes the first is the scene's, and nothing is sampled outside the last
-        new = guide.estimator(boxes[0].detach(), boxes[-1].detach())
+        new = guide.estimator(boxes[0].detach(), boxes[-1].detach(), len(boxes))
         replace_module(host, old, new)
 
 

@@ -116,6 +116,7 @@ class GuidedEstimator(_StandIn):
             aabb = box_around(aabb, guide.frame.cpu())
         return guide.built(build_estimator, aabb=aabb, occupancy=guide.followed())
 
+    @torch.no_grad()
     @functools.wraps(Estimator.sampling)
     def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **kwargs: Any) -> Any:
         guide = self.guide
@@ -169,6 +170,9 @@ class GuidedEstimator(_StandIn):
         estimator: Any = self.sampler
         estimator.update_every_n_steps(*args, **kwargs)
 
+    def mark_invisible_cells(self, *args: Any, **kwargs: Any) -> None:
+        """Called by hosts before training; a gate has no cells to mark."""
+
     @property
     def aabbs(self) -> Tensor:
         """Boxes of the sampler behind this, in the host's coordinates, [n_boxes, 6]."""
@@ -198,7 +202,7 @@ class GuidedEstimator(_StandIn):
         return occupied.view(-1, *sampler.resolution.tolist())
 
     def __getattr__(self, name: str) -> Any:
-        if name in ("resolution", "device"):
+        if name in ("resolution", "levels", "cells_per_lvl", "device"):
             return getattr(self.sampler, name)
         return super().__getattr__(name)
 

@@ -50,6 +50,10 @@ class LearnedOccupancyEstimator(Estimator):
         TypeError: the occupancy is none.
     """
 
+    levels = 1
+    """Boxes in `aabbs`."""
+    cells_per_lvl = ANSWER_RESOLUTION**3
+    """Cells in each box of `binaries`."""
     _box: Tensor
     _snapshot: Snapshot
     _derived_from: list[Tensor]
@@ -163,6 +167,9 @@ class LearnedOccupancyEstimator(Estimator):
 
     def update_every_n_steps(self, *args: Any, **kwargs: Any) -> None:
         """Nothing to update: the gate is frozen."""
+
+    def mark_invisible_cells(self, *args: Any, **kwargs: Any) -> None:
+        """Nothing to mark: a gate has no cells."""
 
     @property
     def aabbs(self) -> Tensor:

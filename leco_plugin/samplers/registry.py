@@ -34,7 +34,9 @@ class SamplerSpec:
     estimator: Callable[..., nn.Module] | str | None = None
     """Builds what a packed host calls (`base.Estimator`), or "module:attribute" of such. Called
     with `aabb` (the host's box, [6], which is that of its grid and not the scene's end),
-    `occupancy` (None when there is none) and options, which are its other parameters."""
+    `occupancy` (None when there is none) and options, which are its other parameters. One that asks
+    no gate and has a parameter `levels` is given the number of the host's nested boxes, unless the
+    options set it."""
     proposal: Callable[..., nn.Module] | str | None = None
     """Builds what a proposal host calls (`proposal.LearnedOccupancySampler`), likewise. Called with
     `occupancy`, with the host's `num_samples`, `initial_sampler` and `single_jitter`, and where
@@ -174,6 +176,13 @@ def _parameters(builder: Callable[..., nn.Module]) -> dict[str, inspect.Paramete
         return None
     by_name = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
     return {name: each for name, each in found.items() if each.kind in by_name}
+
+
+def has_option(name: str, kind: str, option: str) -> bool:
+    """Whether the builder of a sampler, for hosts that call this kind, names such a parameter.
+    ValueError as of `sampler_spec`."""
+    builder = getattr(sampler_spec(name), kind)
+    return builder is not None and option in (_parameters(_load(builder)) or {})
 
 
 def refuse_unknown_options(

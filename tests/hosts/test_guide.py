@@ -45,6 +45,20 @@ def test_a_builder_that_asks_no_gate_is_told_so(monkeypatch: pytest.MonkeyPatch)
     assert guide.proposal(num_samples=4)(5) == 5
 
 
+def test_only_a_sampler_that_has_levels_is_given_those_of_the_host(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    def nested(aabb: torch.Tensor, occupancy: None, levels: int = 1) -> torch.nn.Module:
+        return torch.nn.ModuleList([torch.nn.Identity()] * levels)
+
+    def other(aabb: torch.Tensor, occupancy: None, **options: object) -> torch.nn.Module:
+        return torch.nn.ModuleList([torch.nn.Identity()] * len(options))
+
+    for builder, expected in ((nested, 3), (other, 0)):
+        monkeypatch.setitem(registry.OURS, "other", SamplerSpec("one", estimator=builder))
+        assert len(Guide("other").estimator(BOX, levels=3)) == expected
+
+
 @pytest.mark.parametrize("already", [False, True], ids=["empty", "with another gate"])
 def test_a_checkpoint_brings_its_own_occupancy(guide: Guide, already: bool):
     guide.frame.copy_(2.0 * torch.eye(3, 4))

@@ -38,6 +38,19 @@ class Packed(Host):
         self.walker = VolumetricSampler(self.gatekeeper)
 
 
+@pytest.mark.parametrize("sampler", ["dense", "occupancy-grid"])
+@pytest.mark.parametrize("options", [{}, {"levels": 2}], ids=["as the host", "as asked"])
+def test_a_grid_has_as_many_boxes_as_the_hosts_own_unless_asked_otherwise(
+    sampler: str, options: dict[str, int]
+):
+    host = Packed()
+    own = nerfacc.OccGridEstimator(torch.tensor([-1.0] * 3 + [1.0] * 3), 8, 3)
+    host.gatekeeper = host.walker.occupancy_grid = own
+    swap_sampler(host, Guide(sampler, options))
+    expected = own.aabbs[options.get("levels", 3) - 1]
+    assert torch.equal(host.gatekeeper.bounds(), expected)
+
+
 class Network(nn.Module):
     def __init__(self) -> None:
         super().__init__()

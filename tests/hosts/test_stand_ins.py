@@ -105,6 +105,37 @@ def test_steps_that_do_not_grow_end_at_the_hosts_box():
     assert float(t_ends.max()) > 40.0
 
 
+def test_without_an_outermost_box_they_end_at_the_one_box_that_is_given():
+    inside = torch.tensor([[0.0, 0.0, 0.0]]), torch.tensor([[1.0, 0.0, 0.0]])
+    box = torch.tensor([-1.0] * 3 + [1.0] * 3)
+    guided: Any = an_unbounded_guide(1e-9).estimator(box).eval()
+    _, _, t_ends = guided.sampling(*inside, render_step_size=0.125)
+    assert float(t_ends.max()) == pytest.approx(1.0)
+
+
+def test_samples_carry_no_gradient_of_the_rays_as_nerfaccs_do():
+    """A ray along an axis is parallel to faces of a box: its gradient would be NaN."""
+    guided: Any = an_unbounded_guide(0.5).estimator(BOX)
+    origins = torch.tensor([[0.5, 0.5, -3.0]], requires_grad=True)
+    directions = torch.tensor([[0.0, 0.0, 1.0]], requires_grad=True)
+    indices, t_starts, t_ends = guided.sampling(origins, directions, **TO_THE_SKY)
+    assert len(indices) > 0 and not t_starts.requires_grad and not t_ends.requires_grad
+    middles = (t_starts + t_ends)[:, None] / 2.0
+    (origins[indices] + middles * directions[indices]).sum().backward()
+    for grad in (origins.grad, directions.grad):
+        assert grad is not None and bool(grad.isfinite().all())
+
+
+def test_a_host_may_ask_for_what_grids_of_nerfacc_have(guide: Guide):
+    Guide().estimator(BOX).mark_invisible_cells(None, None, 8, 8)  # before there is an occupancy
+    stand_in = guide.estimator(BOX)
+    assert stand_in.levels == len(stand_in.aabbs)
+    assert stand_in.levels * stand_in.cells_per_lvl == len(stand_in.occs)
+    own = LearnedOccupancyEstimator(ball())
+    own.mark_invisible_cells(torch.eye(3), torch.eye(4)[None], width=8, height=8, near_plane=0.1)
+    assert own.levels * own.cells_per_lvl == own.binaries.numel()
+
+
 TO_THE_SKY: dict[str, Any] = {"cone_angle": 0.125, "far_plane": 40.0, "render_step_size": 0.1}
 
 
