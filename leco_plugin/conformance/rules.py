@@ -267,8 +267,9 @@ RULES = (
         "nothing-superfluous-is-left",
         "grids and proposal networks that nobody asks any more take memory, make "
         "checkpoints large, and slow down each step of an optimizer and of data-parallel training.",
-        "have the HostAdapter remove what the guide stands for from the host; hold "
-        "proposal densities in a list of bound methods, which the built-in adapter finds.",
+        "have the HostAdapter remove what the guide stands for from the host; hold the methods "
+        "density_fn or get_density of proposal networks in a list, which the built-in adapter "
+        "finds, and train all these networks in one parameter group.",
     ),
     Rule(
         "shades-only-what-is-kept",

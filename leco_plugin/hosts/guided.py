@@ -52,10 +52,10 @@ class Host(_Model):
     """Stands before any nerfstudio model among the bases of a class. Its images can be drawn and
     scored without a network."""
 
-    def forward(self, ray_bundle: Any) -> dict[str, Any]:
+    def forward(self, ray_bundle: Any, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """As the model's; its codes are those of the photographs near the view."""
         show_from(self, None if self.training else ray_bundle.origins)
-        outputs: dict[str, Any] = super().forward(ray_bundle)
+        outputs: dict[str, Any] = super().forward(ray_bundle, *args, **kwargs)
         return outputs
 
     def get_outputs_for_camera_ray_bundle(self, *args: Any, **kwargs: Any) -> dict[str, Tensor]:
@@ -109,13 +109,13 @@ class GuidedHost(DrawnInViewer, Host):
         guide = self.leco_guide
         return None if guide.occupancy is None else Drawn(guide.followed(), guide.frame)
 
-    def forward(self, ray_bundle: Any) -> dict[str, Any]:
+    def forward(self, ray_bundle: Any, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """As the host's. The guide learns whether rays come with limits of their own, before a
         collider sets them."""
         guide = self.leco_guide
         guide.cropped = not self.training and getattr(ray_bundle, "nears", None) is not None
         try:
-            outputs: dict[str, Any] = super().forward(ray_bundle)
+            outputs: dict[str, Any] = super().forward(ray_bundle, *args, **kwargs)
             return outputs
         finally:
             guide.cropped = False

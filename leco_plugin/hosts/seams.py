@@ -173,21 +173,43 @@ def no_density(*_: Any, **__: Any) -> None:
     raise RuntimeError("a guided host has no proposal networks to ask for a density")
 
 
+DENSITIES = ("density_fn", "get_density")
+"""Names of the methods by which nerfstudio's fields answer with a density."""
+
+
+def _is_density_of_a_part(item: Any, host: nn.Module) -> bool:
+    """Whether this is such a method of a module in the host; its own are for something else."""
+    owner = getattr(item, "__self__", None)
+    named = getattr(item, "__name__", None) in DENSITIES
+    return named and isinstance(owner, nn.Module) and owner is not host
+
+
 def _density_lists(host: nn.Module) -> Iterator[tuple[str, list[Any] | tuple[Any, ...]]]:
-    """Lists of methods of modules in the host, as proposal hosts hand to their sampler; those of
-    its own methods are for something else."""
+    """Lists of densities of modules in the host, as proposal hosts hand to their sampler."""
     for name, value in vars(host).items():
         if isinstance(value, list | tuple) and value:
-            owners = [getattr(item, "__self__", None) for item in value]
-            if all(isinstance(owner, nn.Module) and owner is not host for owner in owners):
+            if all(_is_density_of_a_part(item, host) for item in value):
                 yield name, value
 
 
-def _remove_density_networks(host: nn.Module) -> None:
+def _proposal_networks(
+    networks: list[nn.Module], groups: dict[str, list[nn.Parameter]]
+) -> list[nn.Module]:
+    """Those networks that no parameter group trains but the groups of the first."""
+    group_of = {id(parameter): name for name, group in groups.items() for parameter in group}
+    trained = [{group_of.get(id(p)) for p in each.parameters()} - {None} for each in networks]
+    return [each for each, names in zip(networks, trained) if names <= trained[0]]
+
+
+def _remove_density_networks(host: Model) -> None:
     """Drops the proposal networks from memory, state dict and parameter groups. An empty module
-    takes their places: a host may go on listing their parameters."""
-    field = getattr(host, "field", None)
+    takes their places: a host may go on listing their parameters. The host's `field` stays, and so
+    does what is trained in another group."""
+    field, groups = getattr(host, "field", None), host.get_param_groups()
     for name, densities in list(_density_lists(host)):
-        for network in {density.__self__ for density in densities} - {field}:
+        found = dict.fromkeys(density.__self__ for density in densities)
+        networks = _proposal_networks([each for each in found if each is not field], groups)
+        for network in networks:
             replace_module(host, network, nn.Module())
-        setattr(host, name, type(densities)([no_density] * len(densities)))
+        left = [no_density if each.__self__ in networks else each for each in densities]
+        setattr(host, name, type(densities)(left))

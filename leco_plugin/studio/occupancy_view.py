@@ -135,13 +135,16 @@ class DrawnInViewer(_Model):
         """What is drawn by; None while there is no frozen occupancy."""
         raise NotImplementedError
 
-    def forward(self, ray_bundle: Any) -> dict[str, Any]:
+    def forward(self, ray_bundle: Any, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """As the model's; in the viewer, as its controls have it."""
         stop_drawing_for_nobody()
         if "leco_view" in self._modules and is_viewer_drawing():
             SHOWN.set(None)  # whatever a picture that was interrupted has left
             drawn = self.leco_drawn()
             if drawn is not None:
-                return self.leco_view.draw(drawn, ray_bundle, super().forward)
-        outputs: dict[str, Any] = super().forward(ray_bundle)
+                forward = super().forward
+                return self.leco_view.draw(
+                    drawn, ray_bundle, lambda rays: forward(rays, *args, **kwargs)
+                )
+        outputs: dict[str, Any] = super().forward(ray_bundle, *args, **kwargs)
         return outputs

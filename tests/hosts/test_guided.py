@@ -23,7 +23,7 @@ from nerfstudio.models.instant_ngp import NGPModel
 from small_hosts import SMALL, pipeline_of, small, unswapped
 from torch import Tensor, nn
 
-from leco_plugin.conformance.hosts import model_arguments
+from leco_plugin.conformance.hosts import bundle, model_arguments
 from leco_plugin.hosts.guide import Guide
 from leco_plugin.hosts.guided import GuidedModelConfig
 from leco_plugin.hosts.stand_ins import GuidedEstimator
@@ -153,6 +153,24 @@ def test_what_guides_a_host_takes_the_place_of_nothing_that_it_has() -> None:
     model = replace(config.model, host=host).setup(**model_arguments())
     assert isinstance(model.guide, nn.Linear)
     assert isinstance(model.leco_guide, Guide)
+
+
+class TakesABatch(NGPModel):
+    """May be told the batch that its rays are of."""
+
+    def forward(self, ray_bundle: Any, batch: Any = None, *, scale: float = 1.0) -> dict[str, Any]:
+        return super().forward(ray_bundle) | {"batch": batch, "scale": scale}
+
+
+@pytest.mark.parametrize("sampler", ["own", "dense"])
+def test_what_a_hosts_forward_takes_beside_rays_reaches_it(sampler: str) -> None:
+    config: Any = with_sampler_swapped(small("instant-ngp"), Path("none")).pipeline
+    host = replace(config.model.host, _target=TakesABatch)
+    occupancy = replace(config.model.occupancy, sampler=sampler)
+    model = replace(config.model, host=host, occupancy=occupancy).setup(**model_arguments()).eval()
+    with torch.no_grad():
+        outputs = model(bundle(), {"image": 3}, scale=2.0)
+    assert outputs["batch"] == {"image": 3} and outputs["scale"] == 2.0
 
 
 def bundle_of(pipeline: Any) -> Any:

@@ -123,6 +123,35 @@ def test_a_list_of_the_hosts_own_methods_is_none_of_proposal_densities(guide: Gu
     assert host.opinions == [no_density] * 3
 
 
+class WithHeads(Proposal):
+    """Holds methods of other parts in lists, too; its field has another name."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.semantics = nn.Linear(3, 4)
+        self.heads = [self.semantics.forward]
+        self.matter, self.field = self.field, None
+        self.opinions.append(self.matter.density_fn)
+        self.alike = (self.scouts[0].density_fn, self.matter.density_fn)
+
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        return {
+            "semantics": list(self.semantics.parameters()),
+            "matter": list(self.matter.parameters()),
+            "scouts": list(self.scouts.parameters()),
+        }
+
+
+def test_a_list_of_other_methods_stays_and_so_does_a_field_among_the_densities(guide: Guide):
+    host = WithHeads()
+    semantics, matter, heads = host.semantics, host.matter, list(host.heads)
+    swap_sampler(host, guide)
+    assert host.semantics is semantics and host.heads == heads
+    assert host.matter is matter and host.opinions == [no_density] * 3 + [matter.density_fn]
+    assert host.alike == (no_density, matter.density_fn)
+    assert not [*host.scouts.parameters(), *host.alone.parameters()]
+
+
 class Boxless(nerfacc.OccGridEstimator):
     """An estimator whose boxes are called otherwise."""
 
