@@ -187,9 +187,9 @@ def _is_density_of_a_part(item: Any, host: nn.Module) -> bool:
 def _density_lists(host: nn.Module) -> Iterator[tuple[str, list[Any] | tuple[Any, ...]]]:
     """Lists of densities of modules in the host, as proposal hosts hand to their sampler."""
     for name, value in vars(host).items():
-        if isinstance(value, list | tuple) and value:
-            if all(_is_density_of_a_part(item, host) for item in value):
-                yield name, value
+        listed = isinstance(value, list | tuple) and len(value) > 0
+        if listed and all(_is_density_of_a_part(item, host) for item in value):
+            yield name, value
 
 
 def _proposal_networks(

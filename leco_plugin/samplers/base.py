@@ -98,8 +98,9 @@ class Estimator(nn.Module):
 
         A fixed threshold rejects every sample of a field that has just begun to learn, which then
         gets no gradient and never learns. A tenth of the mean rejects few while all are alike.
+        Opacities that are NaN do not count.
         """
-        return alphas.mean() * 0.1
+        return alphas.nanmean() * 0.1
 
     def update_every_n_steps(self, *args: Any, **kwargs: Any) -> None:
         """Called by hosts before each training step."""
@@ -201,9 +202,10 @@ def prune(
     alpha_thre: float = 0.0,
     alpha_cap: Callable[[Tensor], Tensor] | None = None,
 ) -> Samples:
-    """Samples with T >= early_stop_eps and alpha >= alpha_thre, in the same order.
+    """Samples but those with T < early_stop_eps or alpha < alpha_thre, in the same order.
 
-    All are asked at once, as nerfacc does; without a function to ask, all are kept.
+    All are asked at once, as nerfacc does; without a function to ask, all are kept. A sample in
+    the light whose answer is NaN is kept, so that the loss shows it.
 
     Args:
         samples: as `march` returns them.
@@ -229,13 +231,13 @@ def prune(
         trans, alphas = render_transmittance_from_density(
             t_starts, t_ends, answers, ray_indices=ray_indices, n_rays=n_rays
         )
-    visible = trans >= early_stop_eps
+    hidden = trans < early_stop_eps
     if alpha_thre > 0.0:
         threshold = alphas.new_tensor(alpha_thre)
         if alpha_cap is not None:
-            threshold = threshold.minimum(alpha_cap(alphas).to(threshold))
-        visible &= alphas >= threshold
-    left = visible.nonzero()[:, 0]
+            threshold = threshold.fmin(alpha_cap(alphas).to(threshold))
+        hidden |= alphas < threshold
+    left = hidden.logical_not_().nonzero()[:, 0]
     ray_indices, t_starts, t_ends = (tensor.index_select(0, left) for tensor in samples)
     return ray_indices, t_starts, t_ends
 

@@ -7,7 +7,7 @@ import torch
 from samplers.analytic_occupancy import Balls, camera_rays
 
 from leco_plugin.samplers import packed
-from leco_plugin.samplers.base import densities_of_samples, prune
+from leco_plugin.samplers.base import DenseEstimator, densities_of_samples, prune
 from leco_plugin.samplers.marching import March, Rays, march
 
 N_RAYS, STEP = 150, 0.01
@@ -73,6 +73,27 @@ def test_pruning_is_two_comparisons(scene):
     for pruned in (by_density, by_alpha):
         assert pruned[0].equal(ray_indices[expected])
         assert pruned[1].equal(t_starts[expected])
+
+
+@pytest.mark.parametrize("asked", ["sigma_fn", "alpha_fn"])
+@pytest.mark.parametrize("cap", [DenseEstimator().alpha_cap, lambda _: torch.tensor(torch.nan)])
+def test_a_sample_in_the_light_whose_answer_is_nan_stays_and_changes_no_other_ray(
+    scene, asked, cap
+):
+    samples = march(scene, March(STEP))
+    answers = densities_of_samples(density, *scene[:2])(samples[1], samples[2], samples[0])
+    if asked == "alpha_fn":
+        answers = 1.0 - torch.exp(-answers * STEP)
+    limits = {"early_stop_eps": 0.01, "alpha_thre": 1e-3, "alpha_cap": cap}
+    expected = prune(samples, N_RAYS, **{asked: lambda *_: answers}, **limits)
+    ray, start = expected[0][0], expected[1][0]
+    bad = (samples[0] == ray) & (samples[1] == start)
+    lacking = answers.masked_fill(bad, torch.nan)
+    found = prune(samples, N_RAYS, **{asked: lambda *_: lacking}, **limits)
+    assert bool(((found[0] == ray) & (found[1] == start)).any())
+    for before, after in zip(expected, found, strict=True):
+        assert torch.equal(before[expected[0] != ray], after[found[0] != ray])
+    assert 0 < len(expected[0]) < len(samples[0])
 
 
 def test_nothing_to_see_is_no_samples(scene):
