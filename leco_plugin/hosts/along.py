@@ -152,8 +152,10 @@ class Along:
     def _teach(self, step: int) -> None:
         """Teaches and calibrates a gate; follows it where it skips more."""
         config, before, started = self.config, self.guide.the_occupancy(), seconds_now()
-        with torch.random.fork_rng(devices=[]):  # batches are those of a run that teaches nothing
-            torch.manual_seed(step)
+        device = self.guide.frame.device
+        cards = [device] if device.type == "cuda" else []
+        with torch.random.fork_rng(cards):  # batches are those of a run that teaches nothing
+            torch.default_generator.manual_seed(step)  # `torch.manual_seed` seeds all cards too
             taught = self._hear(training_bundles(self.manager, config.sharpening.rays))
             bundle, truth = held_out_bundle(self.manager, HELD_OUT_RAYS, step, "calibration")
             held_out = self._hear([bundle])

@@ -92,7 +92,7 @@ def teach(
         steps: of Adam, on `BATCH` positions each.
     """
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+        torch.default_generator.manual_seed(seed)  # `torch.manual_seed` seeds all cards too
         gate = Gate(config).to(lesson.mapped.device)
     rate = 2.0 * RATES["gate"]  # of networks; tables learn at least as fast as those of a field
     tables = list(gate.encoding.parameters())

@@ -121,6 +121,16 @@ def test_its_weights_teach_a_gate_that_keeps_the_ball_and_skips_the_air(made: An
     assert made.host.training and made.guide.listener is None
 
 
+def test_teaching_leaves_random_numbers_as_they_were(
+    made: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seeded: list[int] = []
+    monkeypatch.setattr(torch.cuda, "manual_seed_all", seeded.append)
+    before = torch.get_rng_state()
+    made.teacher._teach(1)
+    assert torch.equal(torch.get_rng_state(), before) and seeded == []
+
+
 def test_what_costs_too_much_in_the_image_is_not_followed(made: Any) -> None:
     made.host.price = 0.1
     made.teacher.after_step(0)
