@@ -230,7 +230,7 @@ def test_the_sampler_may_be_another_packages_too(runs: Runs, tmp_path: Path) -> 
         *("--sampler", "every-second", "--", *runs.arguments("refused")),
         status=2,
     )
-    assert "'every-second' cannot go into this host: it has no proposal" in last_line(refused)
+    assert "sampler 'every-second' has nothing for proposal hosts" in last_line(refused)
 
 
 def test_what_leco_occupancy_leaves_guides_a_host_in_other_coordinates(runs: Runs) -> None:

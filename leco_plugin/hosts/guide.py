@@ -26,8 +26,8 @@ from leco_plugin.samplers.registry import (
     SamplerSpec,
     build_estimator,
     has_option,
-    refuse_unknown_options,
     sampler_spec,
+    spec_for,
 )
 from leco_plugin.scenes.frames import moved, turned
 from leco_plugin.scenes.input_error import (
@@ -106,16 +106,11 @@ class Guide(nn.Module):
     def _spec(self, kind: str | None = None) -> SamplerSpec:
         """What is registered under the sampler's name, and serves this kind of hosts."""
         try:
-            spec = sampler_spec(self.sampler)
-            if kind is not None:
-                if getattr(spec, kind) is None:
-                    raise ValueError(
-                        f"the sampler {self.sampler!r} cannot go into this host: it has no {kind}"
-                    )
-                refuse_unknown_options(self.sampler, self.options, (kind,))
+            if kind is None:
+                return sampler_spec(self.sampler)
+            return spec_for(self.sampler, kind, self.options)
         except ValueError as error:
             raise InputError(str(error)) from None
-        return spec
 
     def changed(self) -> None:
         """Samplers that were made are made anew when they are next asked."""

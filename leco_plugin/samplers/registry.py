@@ -137,17 +137,26 @@ def sampler_spec(name: str) -> SamplerSpec:
     return known[name]
 
 
-def _build(name: str, kind: str, options: dict[str, Any]) -> nn.Module:
+def spec_for(name: str, kind: str, options: Collection[str]) -> SamplerSpec:
+    """The sampler of that name, which serves hosts that call this kind and takes these options.
+
+    Raises:
+        ValueError: there is none, or it does not.
+    """
     spec = sampler_spec(name)
-    builder, occupancy = getattr(spec, kind), options.get("occupancy")
-    if builder is None:
+    if getattr(spec, kind) is None:
         raise ValueError(f"sampler {name!r} has nothing for {HOSTS[kind]} hosts")
+    refuse_unknown_options(name, options, (kind,))
+    return spec
+
+
+def _build(name: str, kind: str, options: dict[str, Any]) -> nn.Module:
+    spec, occupancy = spec_for(name, kind, options.keys() - GIVEN), options.get("occupancy")
     if spec.needs_occupancy:
         if occupancy is None:
             raise ValueError(f"sampler {name!r} needs an occupancy")
         check_gate(name, getattr(getattr(occupancy, "gate", None), "config", None))
-    refuse_unknown_options(name, options.keys() - GIVEN, (kind,))
-    build = _load(builder)
+    build = _load(getattr(spec, kind))
     for needed, parameter in (_parameters(build) or {}).items():
         if parameter.default is parameter.empty and needed not in options:
             raise ValueError(f"sampler {name!r} needs {needed}")
