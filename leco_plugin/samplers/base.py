@@ -67,18 +67,13 @@ DensityFn = Callable[[Tensor], Tensor]
 
 
 class Estimator(nn.Module):
-    """Marches rays and keeps what a subclass calls occupied.
-
-    Attributes:
-        chunk_size: most candidates worked on at once; None chooses by device.
-    """
+    """Marches rays and keeps what a subclass calls occupied."""
 
     _place: Tensor
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
         self.register_buffer("_place", torch.empty(0), persistent=False)
-        self.chunk_size: int | None = None
 
     @property
     def device(self) -> torch.device:
@@ -108,7 +103,7 @@ class Estimator(nn.Module):
 
     def march(self, rays: Rays, rule: March) -> Samples:
         """The candidates along rays that are occupied, whether or not they can be seen."""
-        return march(rays, rule, *self.questions(), chunk_size=self.chunk_size)
+        return march(rays, rule, *self.questions())
 
     @torch.no_grad()
     def sampling(

@@ -56,8 +56,6 @@ def march(
     rule: March,
     occupied: OccupiedFn | None = None,
     near_occupied: NearFn | None = None,
-    *,
-    chunk_size: int | None = None,
 ) -> Samples:
     """Candidates along rays, without those that `occupied` denies.
 
@@ -69,7 +67,6 @@ def march(
             coordinate contiguous (strides (1, N)): cheapest to make and to read.
         near_occupied: a coarse question, asked first and once for 16 candidates in a row; where it
             answers False, `occupied` would deny them all. It changes the time, not the result.
-        chunk_size: most positions asked at once (a run of 16 at least).
 
     Returns:
         ray_indices int64 [n_samples], t_starts [n_samples], t_ends [n_samples], sorted by ray,
@@ -80,11 +77,10 @@ def march(
             more than 2^24 candidates (usually a missing far plane).
     """
     candidates, shortest, longest = plan(rays, rule)
-    if chunk_size is None:
-        chunk_size = CPU_CHUNK if rays.origins.device.type == "cpu" else DEVICE_CHUNK
+    chunk = CPU_CHUNK if rays.origins.device.type == "cpu" else DEVICE_CHUNK
     in_runs = near_occupied is not None or shortest < longest
-    at_once = chunk_size * RUN if in_runs else chunk_size  # a run is one coarse question
-    runs_at_once = max(1, chunk_size // RUN)
+    at_once = chunk * RUN if in_runs else chunk  # a run is one coarse question
+    runs_at_once = max(1, chunk // RUN)
     kept: list[Samples] = []
     for first_ray, tile, n_steps in tiles(candidates, longest, at_once):
         if not in_runs:

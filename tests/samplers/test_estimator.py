@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from samplers.analytic_occupancy import Balls, camera_rays, slow_march
 
 from leco_plugin.models.compute import native
-from leco_plugin.samplers import packed
+from leco_plugin.samplers import marching, packed
 from leco_plugin.samplers.base import DenseEstimator
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.grid import OccupancyGridEstimator
@@ -157,14 +157,15 @@ def test_samples_are_dropped_below_the_given_opacity_and_a_tenth_of_the_mean(
 
 
 @pytest.mark.parametrize("training", [True, False])
-def test_no_more_candidates_than_a_chunk_are_worked_on_at_once(training):
+def test_no_more_candidates_than_a_chunk_are_worked_on_at_once(training, monkeypatch):
     estimator, asked = LearnedOccupancyEstimator(Balls(), cache_bytes=0).train(training), []
     estimator.occupancy.occupied = lambda positions: (
         asked.append(len(positions)) or (positions[:, 0] > 0.0)
     )
     rays = camera_rays(100)
     whole = estimator.sampling(*rays, render_step_size=0.01)
-    at_most, estimator.chunk_size = max(asked), 256
+    at_most = max(asked)
+    monkeypatch.setattr(marching, "CPU_CHUNK", 256)
     asked.clear()
     in_chunks = estimator.sampling(*rays, render_step_size=0.01)
     assert all(map(torch.equal, whole, in_chunks))

@@ -48,16 +48,19 @@ def test_marching_is_one_step_after_the_other(bounds, step_size, cone_angle, chu
     t_mins, t_maxs = torch.tensor(bounds, dtype=torch.float64).reshape(-1, 2).unbind(-1)
     occupied = (lambda positions: positions[:, 0] > 0.0) if asked else None
     rays, rule = Rays(origins, directions, t_mins, t_maxs), March(step_size, cone_angle)
-    samples = march(rays, rule, occupied, chunk_size=chunk_size)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(marching, "CPU_CHUNK", chunk_size)
+        samples = march(rays, rule, occupied)
     expected = slow_march(origins, directions, t_mins, t_maxs, step_size, cone_angle, occupied)
     assert_marched(samples, expected)
 
 
-def test_neighbours_share_their_edge_exactly():
+def test_neighbours_share_their_edge_exactly(monkeypatch):
+    monkeypatch.setattr(marching, "CPU_CHUNK", 50)
     origins, directions = camera_rays(20)
     rays = Rays(origins, directions, torch.zeros(20), torch.full((20,), 3.0))
     for cone_angle in (0.0, 0.01):
-        ray_indices, t_starts, t_ends = march(rays, March(0.01, cone_angle), chunk_size=50)
+        ray_indices, t_starts, t_ends = march(rays, March(0.01, cone_angle))
         same_ray = ray_indices[1:] == ray_indices[:-1]
         assert t_starts[1:][same_ray].equal(t_ends[:-1][same_ray])
 
@@ -147,7 +150,8 @@ def test_rays_that_cannot_be_marched_are_refused_in_one_line():
 
 
 @pytest.mark.parametrize("length", [0.05, 10.0])
-def test_memory_is_bounded_by_the_chunk(length):
+def test_memory_is_bounded_by_the_chunk(length, monkeypatch):
+    monkeypatch.setattr(marching, "CPU_CHUNK", 500)
     origins, directions = camera_rays(100)
     largest = 0
 
@@ -157,7 +161,7 @@ def test_memory_is_bounded_by_the_chunk(length):
         return positions[:, 0] > 10.0
 
     rays = Rays(origins, directions, torch.zeros(100), torch.linspace(0.0, length, 100))
-    march(rays, March(0.01), occupied, chunk_size=500)
+    march(rays, March(0.01), occupied)
     assert largest <= 500
 
 
@@ -169,7 +173,8 @@ def as_on_a_device(monkeypatch):
 
 @pytest.mark.usefixtures("as_on_a_device")
 @pytest.mark.parametrize("chunk_size", [10**6, 2000])
-def test_of_even_rays_each_chunk_is_waited_for_once(chunk_size):
+def test_of_even_rays_each_chunk_is_waited_for_once(chunk_size, monkeypatch):
+    monkeypatch.setattr(marching, "CPU_CHUNK", chunk_size)
     origins, directions = camera_rays(100)
     rays = Rays(origins, directions, torch.zeros(100), torch.ones(100))
     chunks = 0
@@ -180,7 +185,7 @@ def test_of_even_rays_each_chunk_is_waited_for_once(chunk_size):
         return positions[:, 0] > 0.0
 
     with Waits() as waits:
-        march(rays, March(0.01), occupied, chunk_size=chunk_size)
+        march(rays, March(0.01), occupied)
     assert waits.seen == ["tolist"] + ["nonzero"] * chunks
     assert (chunks > 1) == (chunk_size < 10_000)
 
