@@ -15,7 +15,7 @@ from stability_page import has_lost, runs_gone_on
 
 from leco_plugin.chart.learned import learned_of
 from leco_plugin.chart.methods import NEVER_FROZEN, VARIANTS
-from leco_plugin.chart.summary import Verdict, figure_in, lines_of, versus
+from leco_plugin.chart.summary import Line, Verdict, figure_in, lines_of, versus
 from leco_plugin.chart.table import rows
 
 EQUAL_EXPERTS = VARIANTS["leco-occupancy-homogeneous"]
@@ -27,7 +27,9 @@ Values = Sequence[float | None]
 
 HEAD = """On two CPU cores. *City* is the procedural city of 3 x 3 blocks, as `city` is below. Each
 figure is read from the stored result named beside it: the median over seeds, with the least and the
-most. *Yes*: every seed reaches the bar. *In the median*: the median does, some seeds do not. PSNR
+most. Figures of an occupancy are of the gate with which a run ends, as its file declares them.
+*Yes*: every seed reaches the bar. *In the median*: the median does, some seeds do not. A run that
+failed reaches no bar. PSNR
 beside a rival is a difference of means with its 95% interval: ahead, behind, level where that holds
 zero, or undecided where it holds zero and half of it is more than 0.5 dB. A *candidate* is a place
 on a ray at which a model that skips nothing would ask its network. The *price* is what skipping
@@ -91,12 +93,12 @@ class Bar:
 
 
 def of_occupancy(key: str, scale: float = 1.0) -> Callable[[Results], Values]:
-    """Reads a figure of the learned occupancy of a chart, as it was when the gate was frozen."""
+    """Reads a figure of the learned occupancy of a chart, of the gate with which each run ends."""
 
     def read(results: Results) -> Values:
         (learned,) = learned_of(lines_of(results))
-        found = [figure_in(facts, key) for facts in learned.facts]
-        never = [None] * (learned.seeds - len(found))
+        found = [figure_in(facts["at_end"], key) for facts in learned.facts]
+        never = [None] * (learned.seeds - len(found) + failed_runs(results, learned))
         return [None if value is None else scale * value for value in found] + never
 
     return read
@@ -112,9 +114,18 @@ def against(rival: str, what: str) -> Callable[[Results], Values | Verdict]:
         values: Values | Verdict = getattr(
             versus(ours, theirs, results["protocol"]["seconds"]), what
         )
-        return values
+        if not (failed := failed_runs(results, ours)):
+            return values
+        if isinstance(values, Verdict):
+            values = [psnr - theirs.psnr for psnr in ours.psnrs]
+        return [*values, *[None] * failed]
 
     return read
+
+
+def failed_runs(results: Results, line: Line) -> int:
+    """How many runs of a contender ended without a result."""
+    return sum(one["name"] == line.runs[0]["name"] for one in results["failures"])
 
 
 def learning_share(report: Results) -> Values:

@@ -8,10 +8,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import checkout  # noqa: F401
+from chart_sections import stored
 from page_parts import RESULTS, between, noted, table
 from walk import with_walk
 
-from leco_plugin.chart.summary import Line, compare, lines_of
+from leco_plugin.chart.summary import Line, compare, lines_of, seeds_said
+from leco_plugin.evaluation.report import cores_said
 
 DEMO = "<!-- demo: generated -->", "<!-- end of the demo -->"
 GAIN = "<!-- gain: generated -->", "<!-- end of the gain -->"
@@ -36,20 +38,14 @@ STANDS = {
 def readme(text: str) -> str:
     """The README with its tables renewed."""
     text = between(text, DEMO, demo_sentence(json.loads((RESULTS / "demo.json").read_text())))
-    also = f" {without_gifts(_chart(GIFTS_CHART))} {after_half_an_hour(_chart(HALF_HOUR_CHART))}"
+    also = f" {without_gifts(stored(GIFTS_CHART))} {after_half_an_hour(stored(HALF_HOUR_CHART))}"
     text = with_walk(text, ("lines",))
     return between(text, GAIN, gain(also))
 
 
-def _chart(name: str) -> dict[str, Any]:
-    """The stored results of a chart."""
-    found: dict[str, Any] = json.loads((RESULTS / "charts" / f"{name}.json").read_text())
-    return found
-
-
 def gain(also: str = "") -> str:
     """What a learned occupancy gains, and what is to be known of that chart."""
-    chart = _chart(GAIN_CHART)
+    chart = stored(GAIN_CHART)
     said = gain_table(chart, short=bool(also)) + also
     return "\n\n".join([said, *filter(None, [noted(RESULTS).get(GAIN_CHART)])])
 
@@ -135,10 +131,7 @@ def gain_table(results: Mapping[str, Any], short: bool = False) -> str:
     numbers."""
     lines = lines_of(results)
     seconds, scene = results["protocol"]["seconds"], results["scene"]["name"]
-    cores = max(1, results["machine"]["threads"] // results["protocol"].get("at_once", 1))
-    seeds = len({run["seed"] for run in results["runs"]})
-    head = f"`{scene}`, {seconds:g} s on {cores} CPU core{'s' * (cores > 1)}"
-    head += f", {seeds} seed{'s' * (seeds > 1)}"
+    head = f"`{scene}`, {seconds:g} s on {cores_said(results['machine'])}, {seeds_said(results)}"
     rows = [
         [
             f"**{line.name}**" if line.learned else line.name,

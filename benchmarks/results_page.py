@@ -131,15 +131,17 @@ experts, no gate* has as many scene experts, none for empty space, as Switch-NeR
   between equals, one is expected to differ.
 - **Fell**: a run ended more than 0.3 dB below the best point of its own curve.
 - **s to X dB**: after how many seconds of training each method reached what every run reached at
-  last, to stay above it. **Trained**: seconds until the last step had ended, which may be more
+  last, to stay above it. **≤** stands where that is the first evaluation: it may have been before.
+  **Trained**: seconds until the last step had ended, which may be more
   than was given.
 - **Bold**: on the front of its column, so that nothing has more PSNR for less of it. **-**: not
   measured. Figures of quality that no run of a chart has are named below its table.
 - A *candidate* is a place on a ray at which a model that skips nothing would ask its network.
   **Candidates skipped**, **price** and **lost surface mass** are of held-out pixels at the moment
   of freezing (in charts of before 24 November 2026 at the end, which differs where a threshold was
-  lowered), over the seeds in which a gate was frozen; **healed** counts recoveries from
-  collapse. **Volume kept at 1e-3** is of what rays reach of the scene, with the threshold that
+  lowered), over the seeds in which a gate was frozen. **At the end** they are of the gate that the
+  run leaves, often a smaller one; so are **parameters** and **kB**. **Healed** counts recoveries
+  from collapse. **Volume kept at 1e-3** is of what rays reach of the scene, with the threshold that
   loses one thousandth of the surface: so gates and grids are compared at the same price.
 - **True surface kept** and **free space skipped** compare with the exact city.
 

@@ -68,7 +68,7 @@ def results(*runs: dict[str, Any], **changes: Any) -> dict[str, Any]:
     """Results around runs."""
     values: dict[str, Any] = {
         "format": 1,
-        "machine": {"cores": 2, "device": "cpu"},
+        "machine": {"cores": 2, "threads": 2, "device": "cpu"},
         "scene": {"name": "city"},
         "protocol": {"seconds": 10.0, "steps": None},
         "suite": None,

@@ -98,6 +98,32 @@ def test_a_seed_that_never_comes_so_far_reaches_no_bar(
     assert row(tmp_path, f"City: {asked}")[:2] == ["never with 1 of 2 seeds", "**no**"]
 
 
+def test_an_occupancy_has_the_price_of_the_file_that_its_run_leaves(tmp_path: Path) -> None:
+    """At freezing another gate skipped less, for less."""
+    made = chart([0.999, 0.999, 0.999])
+    prices = (0.06, 0.068, 0.0)
+    for one, price in zip(made["runs"], prices):
+        one["occupancy"] |= {"image_price_db": price, "lost_surface_mass": 2e-3}
+        at_first = {"image_price_db": 0.007, "lost_surface_mass": 1e-4, "empty_fraction": 0.6}
+        one["at_freezing"] = at_first
+    store(tmp_path, "charts/city-3", made)
+    for asked, measured, reached in (
+        ("image price", "0.060 dB (0.000 to 0.068, 3 seeds)", "**no**"),
+        ("lost surface mass", "0.200% (0.200 to 0.200, 3 seeds)", "**no**"),
+        ("candidates skipped", "80.0% (80.0 to 80.0, 3 seeds)", "yes"),
+    ):
+        assert row(tmp_path, f"City: {asked}")[:2] == [measured, reached]
+
+
+@pytest.mark.parametrize("asked", ["image price", "sooner at", "PSNR at the end", "renders faster"])
+def test_a_run_that_failed_reaches_no_bar(tmp_path: Path, asked: str) -> None:
+    made = chart([0.999, 0.999])
+    failed = {"name": "LeCO + learned occupancy", "seed": 2, "reason": "no memory"}
+    made["failures"] = [failed, {**failed, "name": "Instant-NGP + own grid"}]
+    store(tmp_path, "charts/city-3", made)
+    assert row(tmp_path, f"City: {asked}")[:2] == ["never with 1 of 3 seeds", "**no**"]
+
+
 def test_what_is_not_stored_says_so_and_reaches_nothing(tmp_path: Path) -> None:
     for asked, measured, *others in table(tmp_path):
         assert measured.startswith(("not stored", "not measured")), asked

@@ -216,11 +216,11 @@ def test_the_gain_is_that_over_each_other_row_of_the_same_host() -> None:
         "runs": runs,
         "protocol": {"seconds": 120.0, "at_once": 2},
         "scene": {"name": "fox"},
-        "machine": {"threads": 2},
+        "machine": {"cores": 4, "threads": 2, "device": "cpu"},
     }
     said, _, head, _, ours, *_, words = parts.gain_table(chart).splitlines()
     assert head == (
-        "| `fox`, 120 s on 1 CPU core, 1 seed | PSNR | to render an image | queries a ray |"
+        "| `fox`, 120 s on 2 CPU cores, one seed | PSNR | to render an image | queries a ray |"
     )
     assert ours == (
         "| **leco-occupancy + learned-occupancy** | 28.0 dB (28.0 to 28.0) | 2.0 s | 15 + 5 small |"
@@ -250,15 +250,25 @@ def test_the_gain_is_that_over_each_other_row_of_the_same_host() -> None:
     )
 
 
+def test_the_gain_says_how_many_runs_failed() -> None:
+    failed = [{"name": "LeCO + own", "seed": 1, "reason": "no memory"}]
+    ours = [run("LeCO + learned-occupancy", seed, gate_queries_per_ray=1.0) for seed in (0, 1)]
+    own = run("LeCO + own", sampler="own", gate_queries_per_ray=0.0)
+    text = parts.gain_table(results(*ours, own, failures=failed))
+    assert "| `city`, 10 s on 2 CPU cores, 1 to 2 seeds; 1 run failed | PSNR |" in text
+
+
 def test_the_readme_says_that_its_chart_was_made_before_a_mend(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(sections, "CHARTS", ROOT / "benchmarks" / "results" / "charts")
     monkeypatch.setattr(parts, "noted", lambda folder: {parts.GAIN_CHART: "Made before."})
     text = (Path(__file__).parent.parent / "README.md").read_text()
     assert f"\n\nMade before.\n{parts.GAIN[1]}" in parts.readme(text)
 
 
 def test_what_is_around_the_tables_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parts, "stored", lambda name: {})
     monkeypatch.setattr(parts, "demo_sentence", lambda report: "demo")
     monkeypatch.setattr(parts, "with_walk", lambda text, names: text)
     monkeypatch.setattr(parts, "gain_table", lambda chart, short: "gain")
@@ -280,7 +290,7 @@ def test_a_suite_is_shown_with_its_question_picture_figures_command_and_machine(
     assert "## Suite `losses` on fox" in text and "Why?" in text
     assert "images/charts/fox-losses-dark.png" in text and "| A | 1 | 21.00 |" in text
     assert "`leco chart --data fox --suite losses`, 2024-02-29, leco_plugin 0.1.0 at 1b." in text
-    assert "cores: 2, device: cpu." in text
+    assert "cores: 2, threads: 2, device: cpu." in text
 
 
 def test_charts_with_a_title_come_first_and_suites_in_their_order(

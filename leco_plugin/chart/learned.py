@@ -24,8 +24,9 @@ class Learned(Line):
 
     @cached_property
     def facts(self) -> list[dict[str, Any]]:
-        """Of each seed with a frozen gate, as it was frozen: as a run's `occupancy`, its `seed`,
-        and whether training ended then."""
+        """Of each seed with a frozen gate: its run's `occupancy`, the figures that
+        `TimedRun.at_freezing` has as they were at freezing, and all as they are `at_end`; its
+        `seed`, and whether it was frozen `at_the_end` of its training."""
         return [
             {
                 **run["occupancy"],

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from leco_plugin.chart.contender import Protocol, shared_method, short_names
+from leco_plugin.evaluation.report import cores_said
 
 CONFIDENCE = 0.95
 """Of the interval around a difference of means; of each comparison alone, however many are made."""
@@ -197,14 +198,23 @@ class Line:
         seconds = shares * ends.mean()
         return seconds, values.mean(axis=0), values.min(axis=0), values.max(axis=0)
 
+    @property
+    def first_evaluations(self) -> tuple[float, ...]:
+        """Seconds of the first point of each curve."""
+        return tuple(float(run["curve"][0][0]) for run in self.runs)
+
+    def seconds_to_each(self, psnr: float) -> tuple[float | None, ...]:
+        """When each of its runs reaches a PSNR to stay, as `seconds_to_pass`."""
+        return tuple(seconds_to_pass(run["curve"], psnr) for run in self.runs)
+
     def seconds_to(self, psnr: float) -> float | None:
         """When its runs reach a PSNR to stay, median over seeds; None if one of them does not."""
-        return middle_of([seconds_to_pass(run["curve"], psnr) for run in self.runs])
+        return middle_of(self.seconds_to_each(psnr))
 
 
 def seconds_to_pass(curve: Sequence[Sequence[float]], psnr: float) -> float | None:
-    """When a curve [[seconds, PSNR], ...] reaches a PSNR and stays above it, interpolated; None
-    for never."""
+    """When a curve [[seconds, PSNR], ...] reaches a PSNR and stays above it, interpolated. None for
+    never; the first point's seconds, at most, where no point is below."""
     below = [i for i, (_, value) in enumerate(curve) if value < psnr]
     if not below:
         return float(curve[0][0])
@@ -267,12 +277,13 @@ def headline(results: Mapping[str, Any], short: bool = False) -> str:
         said = f"{both}: {figures}, {apart} apart ({found.by})"
         others = [line for line in ranked if not line.learned]
         if best.learned and second.learned and others:
-            lead = compare(best.psnrs, others[0].psnrs)
-            if lead.word == "ahead":  # then it has a margin
-                beyond = f"{lead.difference:.2f} ± {lead.margin:.2f}"
+            leads = [compare(line.psnrs, others[0].psnrs) for line in (best, second)]
+            if all(lead.word == "ahead" for lead in leads):  # then they have margins
+                least = f"{leads[1].difference:.2f} ± {leads[1].margin:.2f}"
                 if short:
-                    return f"two methods with learned occupancy lead by {beyond} dB"
-                return f"{said}; {others[0].name}, the best of the others, is {beyond} behind"
+                    return f"two methods with learned occupancy lead by {least} dB"
+                name = f"{others[0].name}, the best of the others"
+                return f"{said}; {name}, is {least} behind {second.name}"
         if not short:
             return said
         level = f"{best.name} is level with the next best"
@@ -290,19 +301,29 @@ def circumstances(results: Mapping[str, Any]) -> str:
     machine, protocol = results["machine"], results["protocol"]
     where, at_once = str(machine["device"]), protocol.get("at_once", 1)
     if where == "cpu":
-        cores = max(1, machine["cores"] // at_once)
-        where = "one CPU core" if cores == 1 else f"{cores} CPU cores"
-        where += " a run" if at_once > 1 else ""
+        where = cores_said(machine) + (" a run" if at_once > 1 else "")
     elif at_once > 1:
         where += f", {at_once} runs at a time"
     length = Protocol(protocol["seconds"], protocol["steps"]).describe()
-    seeds = len({run["seed"] for run in results["runs"]})
-    many = "one seed" if seeds == 1 else f"{seeds} seeds: means of PSNR, medians of costs"
+    many = seeds_said(results)
+    if any(len(line.runs) > 1 for line in lines_of(results)):
+        many += ": means of PSNR, medians of costs"
     method = shared_method(list(dict.fromkeys(run["name"] for run in results["runs"])))
     what = f"{method} on {results['scene']['name']}" if method else results["scene"]["name"]
     said = f"{what}, {length} of training on {where}, {many}"
     tested = results.get("held_out", {}).get("test")
     return said if tested is None else f"{said}, tested on a whole stretch of {len(tested)} cameras"
+
+
+def seeds_said(results: Mapping[str, Any]) -> str:
+    """The least and the most seeds of a contender, and how many runs failed, such as "2 to 5 seeds;
+    3 runs failed"."""
+    counts = [len(line.runs) for line in lines_of(results)]
+    least, most = min(counts), max(counts)
+    said = "one seed" if most == 1 else f"{most} seeds" if least == most else ""
+    said = said or f"{least} to {most} seeds"
+    failed = len(results.get("failures", ()))
+    return f"{said}; {failed} run{'s' * (failed > 1)} failed" if failed else said
 
 
 @dataclass(frozen=True)
@@ -318,6 +339,8 @@ class Versus:
     """The other's median training time as a multiple of those seconds."""
     faster: tuple[float, ...]
     """The other's median time to render an image as a multiple of its own."""
+    first: tuple[float, ...]
+    """Seconds of the first evaluation: a run that passes there may have passed before."""
 
 
 def versus(ours: Line, theirs: Line, seconds: float | None) -> Versus:
@@ -327,11 +350,11 @@ def versus(ours: Line, theirs: Line, seconds: float | None) -> Versus:
     last = statistics.fmean(curve[-1][1] for curve in curves)
     ended = statistics.median(min(curve[-1][0], most) for curve in curves)
     rendered = statistics.median(run[RENDERING.key] for run in theirs.runs)
-    passed = tuple(seconds_to_pass(run["curve"], last) for run in ours.runs)
+    passed = ours.seconds_to_each(last)
     sooner = tuple(None if after is None else ended / after for after in passed)
     faster = tuple(rendered / run[RENDERING.key] for run in ours.runs)
     psnr = compare(ours.psnrs, theirs.psnrs)
-    return Versus(ours.name, theirs.name, psnr, passed, sooner, faster)
+    return Versus(ours.name, theirs.name, psnr, passed, sooner, faster, ours.first_evaluations)
 
 
 def rivals(lines: Sequence[Line], seconds: float | None = None) -> list[Versus]:

@@ -63,6 +63,8 @@ OCCUPANCY = (
     ("image_price_db", "price, dB", 1.0),
     ("lost_surface_mass", "lost surface mass", 1.0),
     ("at_end.empty_fraction", "skipped at the end, %", 100.0),
+    ("at_end.image_price_db", "price at the end, dB", 1.0),
+    ("at_end.lost_surface_mass", "lost at the end", 1.0),
     ("at_equal_loss.kept_reached_volume", "volume kept at 1e-3, %", 100.0),
     ("kept_surface_recall", "true surface kept, %", 100.0),
     ("free_space_skipped", "free space skipped, %", 100.0),
@@ -165,7 +167,7 @@ def runs_table(lines: Sequence[Line]) -> str:
             "seeds": lambda line: str(len(line.runs)),
             "PSNR, dB": lambda line: spread(line.psnrs, ".2f", statistics.fmean),
             **measured,
-            f"s to {level:.1f} dB": lambda line: number(line.seconds_to(level)),
+            f"s to {level:.1f} dB": partial(_seconds_to, level),
             **{title: partial(_median, cost) for title, cost in SPENT.items()},
             **{cost.titled: partial(with_front, cost) for cost in COSTS},
         },
@@ -177,6 +179,47 @@ def _median(cost: Cost, line: Line) -> str:
     return number(line.median(cost))
 
 
+def _seconds_to(psnr: float, line: Line) -> str:
+    """The median over its runs."""
+    known = [after for after in line.seconds_to_each(psnr) if after is not None]
+    said = number(line.seconds_to(psnr))
+    if said == "-":
+        return said
+    bounds = [after for after, first in zip(known, line.first_evaluations) if after == first]
+    return _marked(said, statistics.median_low(known), bounds, "≤")
+
+
+def at_first(passed: Sequence[float | None], first: Sequence[float]) -> list[bool]:
+    """Whether each run passed by its first evaluation, and perhaps before."""
+    return [after == seconds for after, seconds in zip(passed, first)]
+
+
+def bounded_spread(
+    values: Sequence[float | None], form: str, is_bound: Sequence[bool], sign: str
+) -> str:
+    """As `spread`. A sign stands before each figure that may be less ("≤") or more ("≥"), as some
+    values are bounds."""
+    said = spread(values, form)
+    known = [value for value in values if value is not None]
+    bounds = [value for value, bound in zip(values, is_bound) if value is not None and bound]
+    if said == "-" or not bounds:
+        return said
+    middle = statistics.median_low if sign == "≤" else statistics.median_high
+    found = _marked(format(statistics.median(known), form), middle(known), bounds, sign)
+    if len(known) == 1:
+        return found
+    least, most = (
+        _marked(format(end, form), end, bounds, sign) for end in (min(known), max(known))
+    )
+    return f"{found} ({least} to {most})"
+
+
+def _marked(said: str, value: float, bounds: Sequence[float], sign: str) -> str:
+    """A figure with the sign, if the true value behind a bound may be on its other side."""
+    is_open = any(bound >= value if sign == "≤" else bound <= value for bound in bounds)
+    return f"{sign} {said}" if is_open else said
+
+
 def versus_table(duels: Sequence[Versus]) -> str:
     """What learned occupancies gain: the verdict on PSNR, medians of times and of ratios, and the
     least and the most."""
@@ -185,8 +228,12 @@ def versus_table(duels: Sequence[Versus]) -> str:
         {
             "against": lambda duel: f"{duel.ours} against {duel.theirs}",
             "PSNR": lambda duel: duel.psnr.said(),
-            "passes its last PSNR after, s": lambda duel: spread(duel.passed, ".0f"),
-            "sooner by, x": lambda duel: spread(duel.sooner, ".2f"),
+            "passes its last PSNR after, s": lambda duel: bounded_spread(
+                duel.passed, ".0f", at_first(duel.passed, duel.first), "≤"
+            ),
+            "sooner by, x": lambda duel: bounded_spread(
+                duel.sooner, ".2f", at_first(duel.passed, duel.first), "≥"
+            ),
             "renders faster by, x": lambda duel: spread(duel.faster, ".1f"),
         },
     )
@@ -212,7 +259,8 @@ def failures_table(failures: Sequence[Mapping[str, Any]]) -> str:
 
 
 def occupancy_table(learned: Sequence[Learned]) -> str:
-    """Occupancies: medians over the seeds in which a gate was frozen."""
+    """Occupancies: medians over the seeds in which a gate was frozen. Size and true surface kept
+    are of the gate at the end, which may be smaller than the one that was frozen."""
 
     def frozen(one: Learned) -> str:
         late = f", {one.guided_nothing} at the end" if one.guided_nothing else ""

@@ -9,6 +9,7 @@ import math
 import os
 import platform
 import subprocess
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,13 @@ def describe_machine() -> dict[str, Any]:
         "python": platform.python_version(),
         "torch": torch.__version__,
     }
+
+
+def cores_said(machine: Mapping[str, Any]) -> str:
+    """The CPU cores that a run used, in words: as many as its threads, and no more than there
+    are."""
+    cores = min(machine["cores"], machine["threads"])
+    return "one CPU core" if cores == 1 else f"{cores} CPU cores"
 
 
 def describe_code() -> dict[str, Any]:

@@ -11,6 +11,7 @@ from leco_plugin.capacity.choice import (
     WORTH_TEN_TIMES,
     best_gate,
     choose,
+    circumstances,
     common_volume,
     draw,
     grid_that_nearly_suffices,
@@ -107,8 +108,9 @@ def test_a_scene_where_everything_keeps_all_is_drawn(tmp_path: Path) -> None:
     full = [one | {"kept_volume": 1.0} for one in (SMALL_GATE, COARSE | {"octree_bytes": 0})]
     results = {
         "representations": full,
-        "machine": {"cores": 2, "device": "cpu"},
+        "machine": {"cores": 2, "threads": 1, "device": "cpu"},
         "scene": {"name": "fog", "train_images": 9},
         **{"learn_steps": 200, "rays": 8192, "lost_surface_mass": 1e-3},
     }
     assert draw(results, tmp_path / "capacity.png").stat().st_size > 1000
+    assert "; one CPU core. " in circumstances(results)

@@ -23,6 +23,7 @@ from leco_plugin.chart.summary import (
     lines_of,
     rivals,
     seconds_to_pass,
+    seeds_said,
 )
 from leco_plugin.chart.table import table
 
@@ -96,12 +97,16 @@ def test_where_two_that_learn_are_level_the_headline_says_what_they_lead_the_oth
     both = of("A", 21.4, 21.5, 21.6) + of("B", 21.3, 21.5, 21.6)
     dense, grid = {"sampler": "dense"}, {"sampler": "own"}
     ahead = results(*both, *of("C", 20.0, 20.1, 19.9, **dense), *of("D", 19.0, 19.1, 18.9, **grid))
-    said = "two methods with learned occupancy lead by 1.50 ± 0.23 dB"
+    said = "two methods with learned occupancy lead by 1.47 ± 0.31 dB"  # B, the second
     assert headline(ahead, short=True) == said
-    assert headline(ahead).endswith("; C, the best of the others, is 1.50 ± 0.23 behind")
+    assert headline(ahead).endswith("; C, the best of the others, is 1.47 ± 0.31 behind B")
     close = results(*both, *of("C", 18.0, 22.0, 23.0, **dense))
     assert headline(close, short=True) == "A is level with the next best"
     assert "behind" not in headline(close)
+    alone = of("A", 21.4, 21.5, 21.6) + of("B", 19.0, 24.0, 21.0)
+    only_the_first = results(*alone, *of("C", 20.0, 20.1, 19.9, **dense))
+    assert headline(only_the_first, short=True) == "undecided: 21.5 dB for A, 21.3 next"
+    assert "C" not in headline(only_the_first)
     one_run = results(*both, *of("C", 20.0, **dense))
     assert headline(one_run, short=True) == "A is level with the next best"
 
@@ -110,13 +115,29 @@ def test_the_method_that_all_share_is_named_once_and_with_the_scene() -> None:
     shared = results(run("NGP + a", psnr=20.0), run("NGP + b", psnr=21.5))
     assert circumstances(shared) == "NGP on city, 10 s of training on 2 CPU cores, one seed"
     beside = shared | {"protocol": {"seconds": None, "steps": 400, "at_once": 2}}
+    beside["machine"] = {"cores": 2, "threads": 1, "device": "cpu"}  # threads are of each run
     assert circumstances(beside) == (
         "NGP on city, 400 steps of training on one CPU core a run, one seed"
     )
-    mixed = results(run("NGP + a"), run("LeCO, b", 1))
+    mixed = results(*(run(name, seed) for name in ("NGP + a", "LeCO, b") for seed in (0, 1)))
     assert circumstances(mixed) == (
         "city, 10 s of training on 2 CPU cores, 2 seeds: means of PSNR, medians of costs"
     )
+
+
+def test_seeds_are_counted_for_each_contender_and_failed_runs_beside_them(tmp_path: Path) -> None:
+    failures = [
+        {"name": "B", "method": "b", "sampler": "own", "seed": seed, "reason": "no memory"}
+        for seed in (2, 3, 4)
+    ]
+    fewer = results(*of("A", *[20.0] * 5), *of("B", 18.0, 19.0), failures=failures)
+    assert seeds_said(fewer) == "2 to 5 seeds; 3 runs failed"
+    said = "10 s of training on 2 CPU cores, 2 to 5 seeds; 3 runs failed: means of PSNR"
+    assert said in circumstances(fewer)
+    assert said in table(fewer) and said in figure_text(write_page(fewer, tmp_path / "chart.html"))
+    assert seeds_said(results(run("A"), run("B", 1))) == "one seed"
+    one = results(run("A"), failures=failures[:1])
+    assert circumstances(one).endswith(", one seed; 1 run failed")
 
 
 CURVE = [[10.0, 18.0], [20.0, 20.0], [30.0, 19.0], [40.0, 21.0]]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from chart_results import occupancy, results, run
 
-from leco_plugin.chart.table import spread, table
+from leco_plugin.chart.table import bounded_spread, spread, table
 
 FAILURE = {"name": "B", "method": "b", "sampler": "own", "seed": 1, "reason": "a | b"}
 
@@ -38,6 +38,28 @@ def test_figures_that_no_run_has_are_a_line_and_those_that_one_lacks_are_a_dash(
 def test_a_figure_that_a_seed_lacks_is_a_dash() -> None:
     assert spread([1.0, 4.0, 1.0], ".1f") == "1.0 (1.0 to 4.0)"
     assert spread([1.0, None], ".1f") == spread([], ".1f") == "-"
+
+
+def test_what_is_passed_by_the_first_evaluation_was_passed_then_at_the_latest() -> None:
+    early = run("A", psnr=24.0, curve=[[20.0, 22.0], [30.0, 24.0]])
+    late = run("A", 1, psnr=24.0, curve=[[21.0, 18.0], [31.0, 23.0]])
+    other = [run("B", seed, sampler="own", curve=[[20.0, 18.0], [40.0, 20.0]]) for seed in (0, 1)]
+    for runs, to_level, passed, sooner in (
+        ([early], "≤ 20", "≤ 20", "≥ 2.00"),
+        ([late], "25", "25", "1.60"),
+        ([early, late], "≤ 22.5", "≤ 22 (≤ 20 to 25)", "≥ 1.80 (1.60 to ≥ 2.00)"),
+    ):
+        text = table(results(*runs, *other, protocol={"seconds": None, "steps": 400}))
+        assert rows(text, "method")[0][4] == "s to 20.0 dB" and rows(text, "A")[0][4] == to_level
+        assert rows(text, "A against B")[0][2:4] == [passed, sooner]
+
+
+def test_a_bound_below_the_median_leaves_it_as_it_is() -> None:
+    bounds = [True, False, False]
+    assert bounded_spread([1.0, 2.0, 3.0], ".0f", bounds, "≤") == "2 (≤ 1 to 3)"
+    assert bounded_spread([3.0, 2.0, 1.0], ".0f", bounds, "≤") == "≤ 2 (≤ 1 to ≤ 3)"
+    assert bounded_spread([3.0, 2.0, 1.0], ".0f", bounds, "≥") == "2 (1 to ≥ 3)"
+    assert bounded_spread([3.0, None, 1.0], ".0f", bounds, "≤") == "-"
 
 
 def test_the_front_of_a_column_is_bold() -> None:
@@ -83,6 +105,7 @@ def test_what_a_gate_cost_when_it_was_frozen_stands_beside_what_it_skips_at_the_
     made = run("A", occupancy=occupancy(51_000, 0.1), at_freezing=at_first)
     cells = rows(table(results(made)), "A")[1]
     assert cells[6:10] == ["90", "0.02", "0.0002", "80"]
+    assert cells[10:12] == ["0.01", "0.0001"]  # what the file declares
 
 
 def test_runs_of_several_states_of_the_code_are_named() -> None:

@@ -10,7 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from leco_plugin.evaluation.report import describe_code, describe_machine, made_by
+from leco_plugin.evaluation.report import (
+    cores_said,
+    describe_code,
+    describe_machine,
+    made_by,
+)
 from leco_plugin.scenes.whole_files import write_json
 
 
@@ -19,6 +24,16 @@ def test_the_machine_is_described_without_its_name() -> None:
     assert {"cpu", "cores", "device", "torch"} <= json.loads(text).keys()
     assert "/" not in json.loads(text)["device"]
     assert not platform.node() or platform.node() not in text
+
+
+@pytest.mark.parametrize(
+    ("cores", "threads", "said"),
+    [(2, 1, "one CPU core"), (8, 4, "4 CPU cores"), (2, 7, "2 CPU cores")],
+)
+def test_a_run_has_as_many_cores_as_threads_and_no_more_than_there_are(
+    cores: int, threads: int, said: str
+) -> None:
+    assert cores_said({"cores": cores, "threads": threads}) == said
 
 
 def test_a_figure_says_what_made_it_and_when() -> None:
