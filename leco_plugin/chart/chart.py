@@ -153,12 +153,17 @@ class Chart:
         return f"{runs}{beside}, {about}{there}"
 
     def failures(self) -> list[dict[str, Any]]:
-        """Runs that ended without a result, by seed, and whether this call asked for them."""
-        asked, found = {(job.contender.name, job.seed) for job in self.jobs}, []
+        """Runs that ended without a result, by seed, and whether this call asked for them. Those of
+        earlier settings under the same name are left out, as in `results`."""
+        names = {one.key: one.name for one in self.contenders}
+        asked, found = {(job.contender.key, job.seed) for job in self.jobs}, []
         for one in self.folder.failures():
-            row = {key: one["contender"][key] for key in ("name", "method", "sampler")}
-            row |= {key: one[key] for key in ("seed", "reason")}
-            found.append({**row, "asked": (row["name"], row["seed"]) in asked})
+            key = Contender.from_dict(one["contender"]).key
+            row = {name: one["contender"][name] for name in ("name", "method", "sampler")}
+            row |= {name: one[name] for name in ("seed", "reason")}
+            if key in names or row["name"] not in names.values():
+                row["name"] = names.get(key, row["name"])
+                found.append({**row, "asked": (key, row["seed"]) in asked})
         return sorted(found, key=lambda one: (one["seed"], one["name"]))
 
     def results(self) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,8 +18,6 @@ from leco_plugin.scenes.photographs import HeldOut
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
-
-    from leco_plugin.scenes.photographs import HeldOut
 
 LEARNED, GRID, DENSE = "learned-occupancy", "occupancy-grid", "dense"
 """Samplers of the registry."""
@@ -110,11 +108,13 @@ def config_of(
 ) -> TrainerConfig:
     """The config of a contender's training run.
 
-    All contenders read the scene with our parser, so that they render the same test pixels. A host
-    that learns its occupancy first may do so for `learn_seconds`.
+    All contenders read the scene with our parser, so that they render the same test pixels, and
+    draw their rays on the clock. A host that learns its occupancy first may do so for
+    `learn_seconds`.
 
     Raises:
-        InputError: there is no such method, or its reader cannot hold out a stretch.
+        InputError: there is no such method, its reader cannot hold out a stretch, or a process of
+            its own draws its rays.
         ValueError: it has no such setting.
     """
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
@@ -123,7 +123,6 @@ def config_of(
     from leco_plugin.hosts.guided import GuidedModelConfig
     from leco_plugin.method_configs import best_device
     from leco_plugin.models.leco_config import LecoModelConfig
-    from leco_plugin.scenes.input_error import InputError
     from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
     from leco_plugin.studio.dynamic_batch import clamped
     from leco_plugin.swap import registered
@@ -132,6 +131,7 @@ def config_of(
     config.output_dir, config.experiment_name, config.data = folder, "chart", data
     config.machine.device_type = best_device()
     pipeline: Any = clamped(config.pipeline)
+    pipeline.datamanager = in_this_process(pipeline.datamanager)
     pipeline.datamanager.data = data
     if type(pipeline.datamanager.dataparser) is NerfstudioDataParserConfig:
         pipeline.datamanager.dataparser = LecoPhotographsDataParserConfig()
@@ -150,6 +150,27 @@ def config_of(
     for path, value in contender.settings.items():
         config = changed(config, path, value)
     return config
+
+
+def in_this_process(datamanager: Any) -> Any:
+    """The same data and rays from a data manager without processes of its own: what these do, the
+    clock of a run does not count.
+
+    Raises:
+        InputError: it is a third party's, which nothing can replace.
+    """
+    from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
+    from nerfstudio.data.datamanagers.parallel_datamanager import ParallelDataManagerConfig
+
+    if not isinstance(datamanager, ParallelDataManagerConfig):
+        return datamanager
+    if type(datamanager) is not ParallelDataManagerConfig:
+        raise InputError(
+            f"{type(datamanager).__name__} draws rays in other processes, whose time would not "
+            "count: give the method a data manager without them"
+        )
+    names = [one.name for one in fields(VanillaDataManagerConfig) if one.name != "_target"]
+    return VanillaDataManagerConfig(**{name: getattr(datamanager, name) for name in names})
 
 
 def short_names(names: Sequence[str]) -> list[str]:

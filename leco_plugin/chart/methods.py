@@ -95,9 +95,12 @@ def contenders(methods: Sequence[str], samplers: Sequence[str] = ()) -> list[Con
         )
     known = [*registered_samplers(), f"{GRID}-128", OWN_SAMPLER, LONG_STEPS, WITHOUT_GIFTS]
     for sampler in samplers:
-        if sampler not in known and not SIZED_GRID.fullmatch(sampler):
+        sized = SIZED_GRID.fullmatch(sampler)
+        if sampler not in known and not sized:
             listed = ", ".join(sorted(known))
             raise InputError(f"there is no sampler {sampler!r}; there are {listed}")
+        if sized and int(sized[1]) < 2:
+            raise InputError(f"the sampler {sampler!r} has too few cells: {GRID}-2 has the fewest")
     found: dict[str, Contender] = {}
     used: set[str] = set()
     for method in dict.fromkeys(methods):
@@ -178,6 +181,7 @@ def contender_of_host(method: str, sampler: str, host: Any) -> Contender | None:
             changes["occupancy.learning.sizes.gate.encoding.kind"] = spec.gate_encoding
         if sized or sampler == GRID:
             cells = int(sized[1]) if sized else _own_cells_of(host) or 128
+            sampler = f"{GRID}-{cells}"  # one key for each grid, however it was named
             shown, changes = f"grid {cells}³", _grid_changes(host, cells)
     return Contender(f"{METHOD_NAMES.get(method, method)} + {shown}", method, sampler, changes)
 

@@ -204,6 +204,22 @@ def test_runs_of_the_same_name_and_other_settings_are_not_in_its_line(
     ]
 
 
+def test_a_failure_of_earlier_settings_is_none_of_the_chart_that_was_finished(
+    tiny_scene: Path, tmp_path: Path
+) -> None:
+    before = [Contender("b", "a", "own", {"rate": 1.0}), CONTENDERS[0]]
+    failed = make(chart(tiny_scene, tmp_path, contenders=before), Runner(broken="b"))
+    assert [(one["seed"], one["asked"]) for one in failed["failures"]] == [(0, True), (1, True)]
+    finished = make(chart(tiny_scene, tmp_path, contenders=CONTENDERS[:2]), Runner())
+    assert finished["failures"] == [] and len(finished["runs"]) == 4
+
+
+def test_a_failure_that_was_not_asked_for_is_told_apart(tiny_scene: Path, tmp_path: Path) -> None:
+    make(chart(tiny_scene, tmp_path), Runner(broken="b"))
+    others = make(chart(tiny_scene, tmp_path, contenders=CONTENDERS[:1]), Runner())
+    assert [(one["name"], one["asked"]) for one in others["failures"]] == [("b", False)] * 2
+
+
 def test_a_run_says_which_code_has_made_it(tiny_scene: Path, tmp_path: Path) -> None:
     def with_code(job: Job, show: Callable[[float], None]) -> dict[str, Any]:
         code = {"version": "0.1.0", "commit": "1b", "sources": f"of seed {job.seed}"}

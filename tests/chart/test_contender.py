@@ -9,15 +9,27 @@ from typing import Any
 
 import pytest
 from nerfstudio.configs import method_configs
+from nerfstudio.data.datamanagers.base_datamanager import (
+    VanillaDataManager,
+    VanillaDataManagerConfig,
+)
+from nerfstudio.data.datamanagers.parallel_datamanager import ParallelDataManagerConfig
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 
-from leco_plugin.chart.contender import Contender, changed, config_of, short_names
+from leco_plugin.chart.contender import (
+    Contender,
+    changed,
+    config_of,
+    in_this_process,
+    short_names,
+)
 from leco_plugin.chart.methods import contenders
 from leco_plugin.host_configs import leco_ngp
 from leco_plugin.hosts.guided import GuidedModelConfig
 from leco_plugin.method_configs import best_device
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
+from leco_plugin.swap import registered
 
 DATA, FOLDER = Path("scene"), Path("runs")
 
@@ -109,6 +121,29 @@ def test_a_method_of_nerfstudio_reads_the_scene_as_ours_do_and_can_be_guided() -
     assert type(config.pipeline.datamanager.dataparser) is LecoPhotographsDataParserConfig
     model: Any = config.pipeline.model
     assert isinstance(model, GuidedModelConfig) and model.occupancy.sampler == "own"
+
+
+@pytest.mark.parametrize("method", ["nerfacto", "tensorf", "mipnerf", "leco-nerfacto"])
+def test_rays_are_drawn_on_the_clock_and_not_by_another_process(method: str) -> None:
+    """The clock of a run counts one process."""
+    own: Any = registered(method).pipeline
+    made: Any = config_of(contenders([method], ["own"])[0], DATA, FOLDER).pipeline.datamanager
+    assert not isinstance(made, ParallelDataManagerConfig)
+    if isinstance(own.datamanager, ParallelDataManagerConfig):
+        assert type(made) is VanillaDataManagerConfig and made._target is VanillaDataManager
+    assert made.train_num_rays_per_batch == own.datamanager.train_num_rays_per_batch
+    assert made.eval_num_rays_per_batch == own.datamanager.eval_num_rays_per_batch
+    if method != "tensorf":  # that has a reader of its own
+        assert type(made.dataparser) is LecoPhotographsDataParserConfig
+
+
+def test_a_third_party_that_draws_rays_elsewhere_is_refused_in_a_line() -> None:
+    class Elsewhere(ParallelDataManagerConfig):
+        pass
+
+    with pytest.raises(InputError, match=r"^Elsewhere draws rays in other processes") as refused:
+        in_this_process(Elsewhere())
+    assert "\n" not in str(refused.value)
 
 
 def test_every_contender_is_tested_on_the_photographs_that_are_asked_for() -> None:

@@ -72,6 +72,16 @@ def test_an_occupancy_grid_has_the_cells_that_its_name_says_and_the_levels_of_th
     assert one.name == "Instant-NGP + grid 96³"
 
 
+@pytest.mark.parametrize("method", ["leco-ngp", "leco-switch-nerf"])
+def test_a_grid_is_one_contender_however_its_cells_are_written(method: str) -> None:
+    (usual,) = contenders([method], ["occupancy-grid"])
+    cells = usual.sampler.removeprefix("occupancy-grid-")
+    ways = ["occupancy-grid", f"occupancy-grid-{cells}", f"occupancy-grid-0{cells}"]
+    assert contenders([method], ways) == [usual]
+    assert len({one.key for way in ways for one in contenders([method], [way])}) == 1
+    assert usual.name.endswith(f" + grid {cells}³")
+
+
 def test_a_host_that_asks_every_sample_goes_as_far_as_its_own_grid() -> None:
     (one,) = contenders(["leco-ngp"], ["dense"])
     assert one.changes["occupancy.options"] == {"levels": ngp_host().grid_levels}
@@ -156,6 +166,8 @@ def test_what_is_asked_for_twice_is_made_once() -> None:
         (["no-such"], [], "no method 'no-such'.*leco-occupancy-retrained"),
         (["leco-ngp"], ["no-such"], "no sampler 'no-such'.*own"),
         (["leco-ngp"], ["occupancy-grid-"], "no sampler"),
+        (["leco-ngp"], ["occupancy-grid-0"], "'occupancy-grid-0' has too few cells"),
+        (["leco-ngp"], ["occupancy-grid-01"], "'occupancy-grid-01' has too few cells"),
         (["leco-occupancy"], ["own"], "leco-occupancy has none of the samplers own"),
         (["leco-nerfacto"], ["dense"], "leco-nerfacto has none of the samplers dense"),
         (["leco-nerfacto"], ["own", "dense"], "'dense' fits none of leco-nerfacto"),
