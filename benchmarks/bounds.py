@@ -12,16 +12,14 @@ from __future__ import annotations
 import copy
 import itertools
 import json
-import statistics
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import checkout  # noqa: F401
 import tyro
+from large_scene_tables import bounds_verdict
 
-from leco_plugin.chart.summary import compare
 from leco_plugin.evaluation.clock import Budget
 from leco_plugin.evaluation.report import describe_code, describe_machine, made_by
 from leco_plugin.evaluation.timed_run import timed_run
@@ -32,8 +30,6 @@ from leco_plugin.scenes.input_error import TrainingStopped
 from leco_plugin.scenes.whole_files import write_json
 
 Pair = tuple[float, float]
-MAY_LOSE = 0.1
-"""dB by which automatic bounds may be below the best pair."""
 
 
 @dataclass
@@ -54,54 +50,6 @@ class Options:
     """A few steps of two pairs: to see that everything passes."""
     out: Path = Path(__file__).parent / "results" / "bounds.json"
     """Where the figures go."""
-
-
-def verdict(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float | bool | str]]:
-    """Mean PSNR with automatic bounds, of the best pair, and whether the one is near the other.
-
-    The best of several means is above its own expectation, which favours the pair: `against_best`
-    is the verdict against its runs.
-
-    Returns:
-        Without planes and with them, as far as there are runs: see `ways_of`.
-    """
-    automatic = _by_seed(row for row in rows if row["range"] is None)["null"]
-    ways = {name: _by_seed(some) for name, some in ways_of(rows).items()}
-    return {name: _against(automatic, by_hand) for name, by_hand in ways.items() if by_hand}
-
-
-def ways_of(rows: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """Runs with near and far set by hand, by what else was known."""
-    by_hand = [row for row in rows if row["range"] is not None]
-    ways = {"near and far alone": False, "near and far, planes from the data": True}
-    found = {name: [row for row in by_hand if row["planes"] == on] for name, on in ways.items()}
-    return {name: some for name, some in found.items() if some}
-
-
-def _by_seed(rows: Iterable[dict[str, Any]]) -> dict[str, dict[int, float]]:
-    """PSNR by range and seed; a range with which a run has failed is left out."""
-    found: dict[str, dict[int, float]] = {}
-    failed = set()
-    for row in rows:
-        name = json.dumps(row["range"])
-        found.setdefault(name, {})[row["seed"]] = row["psnr"]
-        if row["psnr"] is None:
-            failed.add(name)
-    return {name: values for name, values in found.items() if name not in failed}
-
-
-def _against(
-    automatic: dict[int, float], by_hand: dict[str, dict[int, float]]
-) -> dict[str, float | bool | str]:
-    mean = statistics.fmean(automatic.values())
-    best = max(by_hand.values(), key=lambda values: statistics.fmean(values.values()))
-    best_mean = statistics.fmean(best.values())
-    return {
-        "automatic": mean,
-        "best_by_hand": best_mean,
-        "reached": mean >= best_mean - MAY_LOSE,
-        "against_best": compare([*automatic.values()], [*best.values()]).said(),
-    }
 
 
 def run(options: Options, pair: Pair | None, planes: bool, seed: int) -> dict[str, Any]:
@@ -157,13 +105,12 @@ def main(options: Options) -> None:
             "format": 1,
             "machine": describe_machine(),
             "settings": settings,
-            "verdict": verdict(rows),
             "runs": rows,
         }
         write_json(options.out, report)
         name = f"{pair or 'automatic'}, planes {'on' if planes else 'off'}, seed {seed}"
         print(f"{name}: {rows[-1]['psnr']} dB", flush=True)
-    print(json.dumps(verdict(rows), indent=2))
+    print("\n".join(bounds_verdict(rows)))
 
 
 if __name__ == "__main__":
