@@ -224,7 +224,7 @@ CASES = {
             "ten-seeds",
             "ten seeds",
             "one seed in ten goes bad, and nobody looks",
-            only=(LEARNED, f"{GRID}-128", DENSE),
+            only=(LEARNED,),  # others have no more seeds here than in the yard
             seeds=10,
         ),
         _paper(

@@ -190,8 +190,13 @@ def entries_of(
 
     Args:
         seeds: of each cell. Learned occupancy has more where a case is about seeds.
-        beside: seeds of the samplers that learned occupancy is compared with; none is `seeds`.
+        beside: seeds of the samplers that learned occupancy is compared with, some of `seeds`; none
+            is `seeds`.
+    Raises:
+        InputError: a seed beside is none of `seeds`, so that nothing has it to be compared with.
     """
+    if alone := [seed for seed in dict.fromkeys(beside) if seed not in seeds]:
+        raise InputError(f"--seeds-beside {alone[0]} is none of --seeds: add it there")
     entries = []
     for case in cases:
         wanted = with_references({one.name for one in samplers if case.is_about(one.name)})

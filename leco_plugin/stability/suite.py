@@ -128,6 +128,7 @@ class Suite:
         if not cases or not samplers or not seeds:
             raise ValueError("a table needs at least one case, one sampler and one seed")
         require_seeds([*seeds, *beside])
+        self.entries = entries_of(cases, samplers, seeds, sizes, beside)
         other_sizes = "a table of other sizes, with --quick or without:"
         take_folder(out / SIZES, asdict(sizes), other_sizes, DAMAGED)
         for name in (SCENES, RUNS, FAILURES):
@@ -135,7 +136,6 @@ class Suite:
         self.out, self.cases, self.sizes, self.command = out, list(cases), sizes, command
         self.machine = describe_machine()
         self.made = {"cpu": self.machine["cpu"], **describe_code()}
-        self.entries = entries_of(cases, samplers, seeds, sizes, beside)
         shown = {entry.sampler.name for entry in self.entries}
         self.samplers = [one for one in samplers if one.name in shown]
         self.protocol = Protocol(steps=sizes.steps)

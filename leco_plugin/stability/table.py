@@ -123,12 +123,15 @@ def _count_passes(results: Results) -> str:
 
 
 def verdicts_of(results: Results, sampler: str) -> list[str]:
-    """Verdicts of a sampler on all cases but those that must fail."""
-    return [
-        row["cells"][sampler]["verdict"]
-        for row in results["cases"]
-        if not row["must_fail"] and sampler in row["cells"]
-    ]
+    """Verdicts of a sampler on all cases but those that must fail; where cells are made of the same
+    runs, one verdict for all of them."""
+    found: dict[Any, str] = {}
+    for row in results["cases"]:
+        if not row["must_fail"] and sampler in row["cells"]:
+            cell = row["cells"][sampler]
+            runs = frozenset((row["scene"]["name"], run["name"]) for run in cell.get("runs", ()))
+            found.setdefault(runs or row["name"], cell["verdict"])
+    return [*found.values()]
 
 
 def blind(results: Results) -> list[str]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from leco_plugin.chart.contender import config_of
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.stability.cases import CASES, cases_named
 from leco_plugin.stability.plan import (
     A_RUN,
@@ -101,7 +102,13 @@ def test_samplers_that_stand_beside_may_have_fewer_seeds() -> None:
     assert seeds["glass", "learned"] == seeds["glass", "dense"] == 3
     assert seeds["glass", "grid-128"] == seeds["glass", "dense-proposal"] == 1
     assert seeds["ten-seeds", "learned"] == 10
-    assert seeds["ten-seeds", "dense"] == 3 and seeds["ten-seeds", "grid-128"] == 1
+    assert seeds["ten-seeds", "dense"] == 3
+    assert ("ten-seeds", "grid-128") not in seeds, "it would be the run of the yard once more"
+
+
+def test_a_seed_beside_that_is_no_seed_is_refused_in_a_line() -> None:
+    with pytest.raises(InputError, match=r"^--seeds-beside 7 is none of --seeds: add it there$"):
+        entries_of(cases_named(("glass",)), samplers_named(()), (0, 1), QUICK, beside=(0, 7))
 
 
 def test_references_join_by_themselves() -> None:

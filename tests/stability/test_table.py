@@ -41,6 +41,7 @@ def cell(verdict: str, gap: float | None = -0.05, **values: Any) -> dict[str, An
 def results(*rows: tuple[str, bool, dict[str, dict[str, Any]]]) -> dict[str, Any]:
     cases = [
         {"name": name, "title": name, "why": f"{name}?", "must_fail": must_fail, "cells": cells}
+        | {"scene": {"name": name}}
         for name, must_fail, cells in rows
     ]
     return {"samplers": SAMPLERS, "cases": cases, "made": MADE}
@@ -70,6 +71,14 @@ def test_a_case_in_which_nobody_is_held_to_anything_is_counted_apart() -> None:
     assert headline(results(*rows)) == (
         "learned occupancy passes 1 of 1 cases; for 1 more it has no dense run that trains"
     )
+
+
+def test_cells_of_the_same_runs_are_counted_once() -> None:
+    runs = {"runs": [{"name": "ngp-grid-128-seed-0"}]}
+    grids = [{"learned": cell("pass"), "grid-128": cell("fail", **runs)} for _ in range(3)]
+    shown = results(*zip(("yard", "ten-seeds", "fog"), [False] * 3, grids))
+    shown["cases"][1]["scene"]["name"] = "yard"  # in the fog the same run is another
+    assert headline(shown) == "learned occupancy passes 3 of 3 cases; grid 128³ 0 of 2"
 
 
 @pytest.mark.parametrize(
@@ -128,7 +137,10 @@ def test_a_quick_table_says_that_its_verdicts_mean_nothing() -> None:
 
 
 def test_a_cell_says_what_its_seeds_were() -> None:
-    healed = [{"occupancy": {"recoveries": times}} for times in (None, 3, 1)]
+    healed = [
+        {"name": f"seed-{seed}", "occupancy": {"recoveries": times}}
+        for seed, times in enumerate((None, 3, 1))
+    ]
     one = cell("pass", seeds=3, worst=-0.4, missing=2, runs=healed)
     shown = results(("yard", False, {"learned": one}))
     assert headline(shown).endswith("; 2 seeds of cells are missing")
