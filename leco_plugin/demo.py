@@ -14,15 +14,17 @@ from typing import Any
 import torch
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
+from leco_plugin.chart.contender import changed
+from leco_plugin.chart.methods import SKIPPING_NOTHING
 from leco_plugin.chart.picture import draw_curves, name_ends
 from leco_plugin.chart.summary import Line
 from leco_plugin.chart.theme import LIGHT, new_figure, save_picture, style, themed
-from leco_plugin.evaluation.clock import Budget
+from leco_plugin.evaluation.clock import Budget, forget_peaks
 from leco_plugin.evaluation.equal_loss import occupancy_facts, truth_of
 from leco_plugin.evaluation.inspection import ViewBox
 from leco_plugin.evaluation.occupancy_picture import draw_slice
-from leco_plugin.evaluation.report import describe_code, describe_machine
-from leco_plugin.evaluation.timed_run import timed_run
+from leco_plugin.evaluation.report import cores_said, describe_code, describe_machine
+from leco_plugin.evaluation.timed_run import TimedRun, timed_run
 from leco_plugin.learning.freezing import FILE_NAME
 from leco_plugin.log import bar
 from leco_plugin.method_configs import leco_occupancy
@@ -69,6 +71,8 @@ def run_demo(
         ValueError, OSError: the time is no positive number, or `out` cannot be used.
         RuntimeError: the time was over before the occupancy was learned.
     """
+    command = "leco demo --quick" if quick else "leco demo"
+    command += "" if seconds is None else f" --seconds {seconds:g}"
     seconds = (QUICK_SECONDS if quick else SECONDS) if seconds is None else seconds
     city, capture = QUICK if quick else (CITY, AERIAL)
     if not 0.0 < seconds < math.inf:
@@ -80,7 +84,7 @@ def run_demo(
     guided = _config(folder, out, FULL_LEARNING if quick else seconds)
     budget = Budget(seconds, learn_seconds=MOST_LEARNING * seconds)
     with bar("Guided: learns, freezes, goes on") as show:
-        guided_run, trainer = timed_run(
+        guided_run, trainer = run_with_peaks(
             guided, budget, sampler="learned-occupancy", on_progress=show
         )
     occupancy, facts, truth = _frozen_occupancy(trainer, folder, out)
@@ -90,8 +94,9 @@ def run_demo(
     del trainer, learned
 
     with bar("The same, never frozen") as show:
-        other_run, trainer = timed_run(other, Budget(seconds), sampler="dense", on_progress=show)
-    command = "leco demo --quick" if quick else "leco demo"
+        other_run, trainer = run_with_peaks(
+            other, Budget(seconds), sampler="dense", on_progress=show
+        )
     report = {
         "format": 1,
         "machine": describe_machine(),
@@ -104,6 +109,17 @@ def run_demo(
     report["seconds_in_all"] = round(time.monotonic() - began, 1)
     write_json(out / "report.json", report)
     return report
+
+
+def run_with_peaks(
+    config: TrainerConfig, budget: Budget, **options: Any
+) -> tuple[TimedRun, Trainer]:
+    """`timed_run` with peaks of memory of its own; None where the system cannot reset them."""
+    is_own = forget_peaks()
+    run, trainer = timed_run(config, budget, **options)
+    if not is_own:
+        run.peak_process_bytes, run.peak_memory_bytes = None, run.peak_allocator_bytes
+    return run, trainer
 
 
 def _scene_facts(city: CityConfig, capture: CaptureConfig, manager: Any) -> dict[str, Any]:
@@ -120,8 +136,8 @@ def _scene_facts(city: CityConfig, capture: CaptureConfig, manager: Any) -> dict
 
 def draw_chart(report: dict[str, Any], path: Path) -> Path:
     """Draws the demo's chart from its report: PSNR against seconds of training of both runs."""
-    runs, blocks, cores = report["runs"], report["scene"]["blocks"], report["machine"]["cores"]
-    where = f"{cores} CPU cores" if report["machine"]["device"] == "cpu" else "one GPU"
+    runs, blocks, machine = report["runs"], report["scene"]["blocks"], report["machine"]
+    where = cores_said(machine) if machine["device"] == "cpu" else "one GPU"
     gain = runs[0]["psnr"] - runs[1]["psnr"]
     title = f"{gain:+.1f} dB after the same time, by skipping what is empty"
     names = ("skips what it has\nlearned is empty", "the same model,\nskipping nothing")
@@ -149,9 +165,9 @@ def never_frozen(config: TrainerConfig, learn_steps: int) -> TrainerConfig:
     """The same method with as many learning steps, never frozen: nothing is skipped."""
     config = copy.deepcopy(config)
     config.method_name = NEVER_FROZEN
-    model: Any = config.pipeline.model
-    model.schedule = replace(model.schedule, freeze=False, learn_steps=learn_steps)
-    model.front_to_back = True  # as guided images are rendered by themselves
+    pipeline: Any = config.pipeline
+    for path, value in {**SKIPPING_NOTHING, "schedule.learn_steps": learn_steps}.items():
+        pipeline.model = changed(pipeline.model, path, value)
     return config
 
 

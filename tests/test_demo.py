@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,36 @@ RUN = {
 }
 
 
+@pytest.mark.parametrize(("can_forget", "peak"), [(True, 7), (False, None)])
+def test_a_run_has_the_peak_of_its_own_memory_or_none(
+    monkeypatch: pytest.MonkeyPatch, can_forget: bool, peak: int | None
+) -> None:
+    """The kernel's mark is of the whole process, in which the demo makes two runs."""
+    from leco_plugin import demo
+    from leco_plugin.evaluation.timed_run import TimedRun
+
+    made = TimedRun("a", "b", 0, peak_memory_bytes=7, peak_process_bytes=7)
+    order: list[str] = []
+    monkeypatch.setattr(demo, "forget_peaks", lambda: order.append("forget") or can_forget)
+    monkeypatch.setattr(demo, "timed_run", lambda *_, **__: order.append("run") or (made, None))
+    run, _ = demo.run_with_peaks(None, demo.Budget(1.0), sampler="b")
+    assert order == ["forget", "run"]
+    assert (run.peak_memory_bytes, run.peak_process_bytes) == (peak, peak)
+
+
+def test_the_never_frozen_run_skips_nothing_as_in_charts() -> None:
+    from leco_plugin import demo
+    from leco_plugin.chart.contender import config_of
+    from leco_plugin.chart.methods import NEVER_FROZEN
+
+    guided = demo._config(Path("city"), Path("out"), 75.0)
+    ours = demo.never_frozen(guided, 123).pipeline.model
+    theirs = config_of(NEVER_FROZEN, Path("city"), Path("out")).pipeline.model
+    assert ours.schedule.learn_steps == 123
+    assert guided.pipeline.model.schedule.freeze and not ours.schedule.freeze
+    assert replace(ours, schedule=theirs.schedule) == theirs
+
+
 @pytest.mark.slow
 def test_the_demo_reports_both_runs_in_the_agreed_form(tmp_path: Path) -> None:
     from leco_plugin.demo import summary
@@ -39,7 +70,7 @@ def test_the_demo_reports_both_runs_in_the_agreed_form(tmp_path: Path) -> None:
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["format"] == 1 and report["scene"]["blocks"] == 1
     assert {"date", "commit", "sources"} <= report["made"].keys()
-    assert report["made"]["command"] == "leco demo --quick"
+    assert report["made"]["command"] == "leco demo --quick --seconds 3"
     assert {"machine", "scene", "occupancy", "runs"} <= report.keys()
     assert report["occupancy"].keys() >= OCCUPANCY
     methods = [(run["method"], run["sampler"]) for run in report["runs"]]

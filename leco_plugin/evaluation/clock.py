@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import sys
 import time
@@ -12,7 +13,9 @@ from pathlib import Path
 
 import torch
 
-STATUS = Path("/proc/self/status")
+STATUS, MARKS = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+RESET_PEAK = "5"
+"""Written to `MARKS`, it lowers the kernel's mark of the peak to what is held now: see proc(5)."""
 
 
 def seconds_now() -> float:
@@ -114,6 +117,19 @@ def peak_process_bytes() -> int:
 
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+
+
+def forget_peaks() -> bool:
+    """Makes later peaks those of what follows; returns whether the system can do so. What earlier
+    work left in memory still counts."""
+    gc.collect()
+    if torch.cuda.is_available():
+        torch.cuda.reset_peak_memory_stats()
+    try:
+        MARKS.write_text(RESET_PEAK)
+    except OSError:
+        return False
+    return True
 
 
 def peak_allocator_bytes() -> int | None:

@@ -84,9 +84,10 @@ class TimedRun:
     train_queries: Counter[str] = field(default_factory=Counter)
     """In all of the training."""
     render_seconds_per_image: float = 0.0
-    peak_memory_bytes: int = 0
-    """Of the allocator on CUDA, of the process elsewhere."""
-    peak_process_bytes: int = 0
+    peak_memory_bytes: int | None = 0
+    """Of the allocator on CUDA, of the process elsewhere; None where it may be that of other
+    work."""
+    peak_process_bytes: int | None = 0
     peak_allocator_bytes: int | None = None
     curve: list[tuple[float, float]] = field(default_factory=list)
     """Seconds of training, and PSNR on test pixels."""

@@ -12,7 +12,13 @@ import pytest
 import torch
 
 from leco_plugin.evaluation import clock as clock_module
-from leco_plugin.evaluation.clock import Budget, Clock, peak_allocator_bytes, peak_process_bytes
+from leco_plugin.evaluation.clock import (
+    Budget,
+    Clock,
+    forget_peaks,
+    peak_allocator_bytes,
+    peak_process_bytes,
+)
 
 
 class Time:
@@ -103,6 +109,21 @@ def test_what_was_held_and_let_go_is_in_the_peak() -> None:
     held[::4096] = b"x" * len(held[::4096])
     del held
     assert HELD < peak_process_bytes() < 64 * 2**30
+
+
+def test_what_was_held_before_is_in_no_later_peak(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    if not forget_peaks():
+        pytest.skip("this system keeps its mark")
+    held = bytearray(HELD)
+    held[::4096] = b"x" * len(held[::4096])
+    with_it = peak_process_bytes()
+    del held
+    assert forget_peaks()
+    assert peak_process_bytes() < with_it - HELD / 2
+    monkeypatch.setattr(clock_module, "MARKS", tmp_path)  # a folder cannot be written
+    assert not forget_peaks()
 
 
 def test_a_small_process_started_by_a_large_one_has_a_small_peak() -> None:
