@@ -29,11 +29,11 @@ HEAD = """On two CPU cores. *City* is the procedural city of 3 x 3 blocks, as `c
 figure is read from the stored result named beside it: the median over seeds, with the least and the
 most. Figures of an occupancy are of the gate with which a run ends, as its file declares them.
 *Yes*: every seed reaches the bar. *In the median*: the median does, some seeds do not. A run that
-failed reaches no bar. PSNR
-beside a rival is a difference of means with its 95% interval: ahead, behind, level where that holds
-zero, or undecided where it holds zero and half of it is more than 0.5 dB. A *candidate* is a place
-on a ray at which a model that skips nothing would ask its network. The *price* is what skipping
-costs held-out pixels, *lost surface mass* what it leaves out of the weight near surfaces."""
+failed reaches no bar. PSNR beside a rival is a difference of means with its 95% interval: ahead,
+behind, level where that holds zero, or undecided where it holds zero and half of it is more than
+0.5 dB. A *candidate* is a place on a ray at which a model that skips nothing would ask its network.
+The *price* is what skipping costs held-out pixels, *lost surface mass* what it leaves out of the
+weight near surfaces."""
 
 
 @dataclass(frozen=True)
