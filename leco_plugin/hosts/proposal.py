@@ -62,6 +62,12 @@ class _ProposalSampler(nn.Module):
         """As `generate_ray_samples`, by which nerfstudio's samplers are changed."""
         return self.generate_ray_samples(*rays, **options)
 
+    def set_anneal(self, anneal: float) -> None:
+        """Called by hosts for proposal networks; nothing is annealed here."""
+
+    def step_cb(self, step: int) -> None:
+        """Called by hosts after a training step; nothing is scheduled here."""
+
     def _draw(self, ray_bundle: RayBundle) -> tuple[RaySamples, Tensor, RaySamples]:
         """Samples, weights of candidates, and candidates."""
         raise NotImplementedError
@@ -131,12 +137,6 @@ class LearnedOccupancySampler(_ProposalSampler):
         self.pdf_sampler = PDFSampler(
             include_original=False, single_jitter=single_jitter, histogram_padding=0.0
         )
-
-    def set_anneal(self, anneal: float) -> None:
-        """Called by hosts for proposal networks; a frozen gate needs no annealing."""
-
-    def step_cb(self, step: int) -> None:
-        """Called by hosts after a training step; nothing is scheduled here."""
 
     def _draw(self, ray_bundle: RayBundle) -> tuple[RaySamples, Tensor, RaySamples]:
         candidates = self.initial_sampler(ray_bundle, num_samples=self.num_candidates)

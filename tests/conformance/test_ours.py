@@ -43,9 +43,12 @@ def test_the_learned_occupancy_keeps_every_rule(seam, rules):
 
 
 @in_forks
-@pytest.mark.parametrize("name", ["dense", "occupancy-grid"])
-def test_the_baselines_keep_every_rule(name):
-    assert {verdict.seam for verdict in kept(sampler_cases(name))} == {"estimator"}
+@pytest.mark.parametrize(
+    ("name", "seam"),
+    [("dense", "estimator"), ("occupancy-grid", "estimator"), ("dense-proposal", "proposal")],
+)
+def test_the_baselines_keep_every_rule(name, seam):
+    assert {verdict.seam for verdict in kept(sampler_cases(name))} == {seam}
 
 
 @pytest.mark.parametrize("features", ["hash", "vm", "k-planes"])
