@@ -6,7 +6,11 @@ from collections.abc import Iterator
 
 import torch
 
-from leco_plugin.conformance import host_images, host_training  # noqa: F401 (checks of hosts)
+from leco_plugin.conformance import (  # noqa: F401 (checks that are registered)
+    host_images,
+    host_training,
+    visibility,
+)
 from leco_plugin.conformance.estimators import EstimatorCase
 from leco_plugin.conformance.hosts import HostCase
 from leco_plugin.conformance.proposals import ProposalCase

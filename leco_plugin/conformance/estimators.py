@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-from functools import partial
 from itertools import zip_longest
 from typing import Any
 
@@ -19,6 +18,7 @@ from leco_plugin.conformance.samplers import (
     devices,
 )
 from leco_plugin.conformance.scene import (
+    AROUND,
     BACKGROUND,
     EVERYTHING,
     LONG_STEP,
@@ -40,6 +40,7 @@ from leco_plugin.conformance.scene import (
     cut_short,
     dense,
     in_order,
+    leaving,
     render,
     same,
     stretched,
@@ -48,7 +49,7 @@ from leco_plugin.conformance.scene import (
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.marching import Samples
-from leco_plugin.samplers.packed import pack_info, render_transmittance_from_density
+from leco_plugin.samplers.packed import pack_info
 from leco_plugin.samplers.registry import build_estimator
 
 TEACHING_STEPS = (0, 16)
@@ -76,9 +77,13 @@ class EstimatorCase(SamplerCase):
         samples = sampler.sampling(
             rays_o=rays.origins,
             rays_d=rays.directions,
-            t_min=rays.t_min,
-            t_max=rays.t_max,
-            **{"render_step_size": STEP, "stratified": sampler.training, **options},
+            **{
+                "t_min": rays.t_min,
+                "t_max": rays.t_max,
+                "render_step_size": STEP,
+                "stratified": sampler.training,
+                **options,
+            },
         )
         are_three = isinstance(samples, (tuple, list)) and len(samples) == 3
         require(
@@ -97,6 +102,10 @@ class EstimatorCase(SamplerCase):
 
 NEAR, FAR = 2.5, 3.4
 """Planes that cut into some of the rays of `cut_short` at either end."""
+NO_LIMITS = {"t_min": None, "t_max": None}
+"""As Instant-NGP has it: rays begin and end at the planes."""
+PLANES = ((NEAR, FAR), (0.05, 1e3))
+"""Near and far planes of such hosts; the second are those of Instant-NGP."""
 
 
 @checks("signature", "estimator")
@@ -151,6 +160,33 @@ def sorted_disjoint_inside(case: EstimatorCase) -> None:
     planes: dict[str, Any] = {"near_plane": NEAR, "far_plane": FAR, "render_step_size": LONG_STEP}
     for training in (False, True):
         check_intervals(narrower, case.sample(sampler.train(training), many, **planes))
+    for near, far in PLANES:
+        _check_between_planes(case, sampler, near, far)
+
+
+def _check_between_planes(case: EstimatorCase, sampler: Any, near: float, far: float) -> None:
+    """Raises unless rays without limits of their own are sampled from near plane to far plane."""
+    rays = crossing()
+    planes = {"near_plane": near, "far_plane": far}
+    ends = {"t_min": torch.full_like(rays.t_min, near), "t_max": torch.full_like(rays.t_max, far)}
+    between = rays._replace(**ends)
+    for training in (True, False):
+        sampler.train(training)
+        try:
+            found = case.sample(sampler, rays, **planes, **NO_LIMITS)
+        except Broken:
+            raise
+        except Exception as error:
+            said = f"{type(error).__name__}: {error}"
+            raise Broken(f"sampling without t_min and t_max raises {said}") from error
+        check_intervals(between, found)
+    expected = case.sample(sampler, between)
+    apart = int((~among(expected, found)).sum() + (~among(found, expected)).sum())
+    require(
+        apart <= ALLOWED_DIFFERENCE * len(expected[0]),
+        f"with near_plane {near:g} and far_plane {far:g} in place of t_min and t_max, {apart} of "
+        f"{len(expected[0])} samples differ",
+    )
 
 
 @checks("packing-consistent", "estimator")
@@ -232,10 +268,6 @@ ALLOWED_DIFFERENCE = 0.005
 """Share of all samples that a rounding at the sides of the box may add or take away."""
 CONE_ANGLE = 0.02
 """Growth of the steps with distance, which makes them half as long again at the far end."""
-SLACK = 1e-3
-"""Relative distance from a threshold at which a rounding does not decide."""
-LOWEST_CAP = 0.1
-"""Of the mean opacity of all samples: the least that an opacity threshold may be lowered to."""
 
 
 @checks("skips-only-what-it-may", "estimator")
@@ -252,6 +284,10 @@ def skips_only_what_it_may(case: EstimatorCase) -> None:
             if case.needs_occupancy:
                 _check_skipped_is_not(rays, samples, scene)
             _check_kept_is_sampled(rays, samples, scene, step, training)
+    if case.needs_occupancy:  # the host's box is not where an unbounded scene ends
+        samples = case.sample(case.shared(AROUND), leaving())
+        _check_skipped_is_not(leaving(), samples, AROUND)
+        _check_kept_is_sampled(leaving(), samples, AROUND)
 
 
 def _check_skipped_is_not(rays: Rays, samples: Samples, scene: Slab) -> None:
@@ -268,7 +304,7 @@ def _check_kept_is_sampled(
 
     The middles of shifted samples are half a step away, and the ends of a ray may have none.
     """
-    ray_indices, t_starts, t_ends = dense(rays, step=step)
+    ray_indices, t_starts, t_ends = dense(rays, step=step, unbounded=scene.unbounded)
     middles = (t_starts + t_ends) / 2.0
     positions = rays.at(ray_indices, middles)
     from_ends = torch.minimum(middles - rays.t_min[ray_indices], rays.t_max[ray_indices] - middles)
@@ -299,52 +335,6 @@ def all_kept_equals_dense(case: EstimatorCase) -> None:
             f"with cone_angle {cone_angle:g} {missing} of {len(expected[0])} candidates are "
             f"missing, {extra} samples are none of them",
         )
-
-
-@checks("visibility-pruning", "estimator")
-def visibility_pruning(case: EstimatorCase) -> None:
-    """With a density or opacity, what light does not reach and what is too faint is dropped, and
-    nothing else."""
-    rays, sampler = crossing(), case.shared(EVERYTHING)
-    for training in (False, True):
-        sampler.train(training)
-        plain = in_order(case.sample(sampler, rays, stratified=False))
-        for limits in ((0.0, 0.0), (1e-2, 0.0), (0.0, 1e-2), (1e-2, 1e-2)):
-            _check_pruned(case, sampler, rays, plain, *limits)
-
-
-def _check_pruned(
-    case: EstimatorCase, sampler: Any, rays: Rays, plain: Samples, eps: float, alpha_thre: float
-) -> None:
-    ray_indices, t_starts, t_ends = plain
-    densities = _wall(rays, t_starts, t_ends, ray_indices)
-    light, alphas = render_transmittance_from_density(
-        t_starts, t_ends, densities, ray_indices=ray_indices, n_rays=len(rays.origins)
-    )
-    visible = light >= eps * (1.0 + SLACK)
-    visible &= alphas >= alpha_thre * (1.0 + SLACK)
-    dark = light < eps * (1.0 - SLACK)
-    faint = alphas < min(alpha_thre, LOWEST_CAP * float(alphas.mean())) * (1.0 - SLACK)
-    limits = {"early_stop_eps": eps, "alpha_thre": alpha_thre}
-
-    def alpha_fn(t_starts: Tensor, t_ends: Tensor, ray_indices: Tensor) -> Tensor:
-        return 1.0 - torch.exp(-_wall(rays, t_starts, t_ends, ray_indices) * (t_ends - t_starts))
-
-    for name, function in (("sigma_fn", partial(_wall, rays)), ("alpha_fn", alpha_fn)):
-        options: dict[str, Any] = {name: function, "stratified": False, **limits}
-        kept = among(plain, case.sample(sampler, rays, **options))
-        given = f"with {name}, early_stop_eps {eps} and alpha_thre {alpha_thre}"
-        lost = int((visible & ~kept).sum())
-        require(lost == 0, f"{given}: {lost} of {int(visible.sum())} visible samples are dropped")
-        for kind, dropped in (("in the dark", dark), ("too faint to be seen", faint)):
-            left, count = int((dropped & kept).sum()), int(dropped.sum())
-            require(left == 0, f"{given}: {left} of {count} samples {kind} are kept")
-
-
-def _wall(rays: Rays, t_starts: Tensor, t_ends: Tensor, ray_indices: Tensor) -> Tensor:
-    """A thin fog with an opaque slab in it: density of samples, [N]."""
-    positions = rays.at(ray_indices, (t_starts + t_ends) / 2.0)
-    return 0.05 + SLAB.density(positions)[:, 0] / STEP
 
 
 @checks("update-while-frozen-is-harmless", "estimator")

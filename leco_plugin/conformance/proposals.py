@@ -16,8 +16,10 @@ from leco_plugin.conformance.samplers import (
     devices,
 )
 from leco_plugin.conformance.scene import (
+    AROUND,
     BACKGROUND,
     EVERYTHING,
+    FAR_AWAY,
     MOVED,
     ROUNDING,
     SLAB,
@@ -28,6 +30,7 @@ from leco_plugin.conformance.scene import (
     check_order,
     crossing,
     cut_short,
+    leaving,
     same,
     without_samples,
 )
@@ -91,15 +94,19 @@ def no_density(*_: Any, **__: Any) -> None:
 
 
 def ray_bundle(rays: Rays) -> Any:
-    """Rays as nerfstudio hands them to a sampler."""
+    """Rays as nerfstudio hands them to a sampler, each of a camera and at a time of its own."""
     from nerfstudio.cameras.rays import RayBundle
 
+    numbers = torch.arange(len(rays.t_min), device=rays.t_min.device)[:, None]
     return RayBundle(
         origins=rays.origins,
         directions=rays.directions,
         pixel_area=torch.full_like(rays.t_min, 1e-6)[:, None],
         nears=rays.t_min[:, None],
         fars=rays.t_max[:, None],
+        camera_indices=numbers,
+        times=numbers.to(rays.t_min),
+        metadata={"numbers": numbers},
     )
 
 
@@ -151,12 +158,31 @@ def shapes_types_devices(case: ProposalCase) -> None:
             len(weights) == len(candidates) == LEVELS,
             f"{LEVELS} density_fns got {len(weights)} weights and {len(candidates)} samples",
         )
-        _check_tensors("ray_samples", rays, *_edges(ray_samples))
+        starts, ends = _edges(ray_samples)
+        require(isinstance(ray_samples.deltas, Tensor), "ray_samples have no deltas")
+        _check_tensors("ray_samples", rays, starts, ends, ray_samples.deltas)
+        apart = float((ray_samples.deltas - (ends - starts)).abs().max())
+        require(apart <= ROUNDING, f"deltas differ from the samples' lengths by up to {apart:.2g}")
+        _check_described(ray_samples, ray_bundle(rays))
         for level in range(LEVELS):
             starts, ends = _edges(candidates[level])
             _check_tensors(f"level {level}", rays, starts, ends, weights[level])
             require(bool((weights[level] >= 0.0).all()), f"level {level} has weights below 0")
         sampler.to("cpu")
+
+
+def _check_described(ray_samples: Any, rays: Any) -> None:
+    """Raises unless samples carry what a field may ask of their rays."""
+    metadata, numbers = ray_samples.metadata or {}, rays.metadata["numbers"]
+    for name, found, given in (
+        ("camera_indices", ray_samples.camera_indices, rays.camera_indices),
+        ("times", ray_samples.times, rays.times),
+        ("metadata", metadata.get("numbers"), numbers),
+    ):
+        require(found is not None, f"the rays have {name}, and their samples have none")
+        wanted = given[:, None].expand_as(ray_samples.frustums.starts)
+        equal = found.shape == wanted.shape and bool((found == wanted).all())
+        require(equal, f"{name} of samples are not those of their rays")
 
 
 def _edges(ray_samples: Any) -> tuple[Tensor, Tensor]:
@@ -194,6 +220,7 @@ def skips_only_what_it_may(case: ProposalCase) -> None:
         _check_gathered(case, case.shared(SLAB).train(training))
     if case.needs_occupancy:
         _check_gathered(case, _in_other_coordinates(case).eval())
+        _check_gathered(case, case.shared(AROUND), leaving(), AROUND)
 
 
 def _in_other_coordinates(case: ProposalCase) -> Any:
@@ -204,13 +231,15 @@ def _in_other_coordinates(case: ProposalCase) -> Any:
         raise Broken(f"no host in other coordinates can have it (frame=): {error}") from error
 
 
-def _check_gathered(case: ProposalCase, sampler: Any) -> None:
-    rays = crossing()
-    enters, leaves = chords(rays)
+def _check_gathered(
+    case: ProposalCase, sampler: Any, rays: Rays | None = None, scene: Slab = SLAB
+) -> None:
+    rays = rays or crossing()
+    enters, leaves = chords(rays, scene)
     long = leaves - enters >= CHORD
     ray_indices, t_starts, t_ends = case.sample(sampler, rays)
     middles = (t_starts + t_ends) / 2.0
-    depths = SLAB.depth(rays.at(ray_indices, middles)).view(len(rays.origins), -1)[long]
+    depths = scene.depth(rays.at(ray_indices, middles)).view(len(rays.origins), -1)[long]
     middles = middles.view(len(rays.origins), -1)[long]
     inside = depths > 0.0
     without = int((~inside.any(dim=1)).sum())
@@ -225,11 +254,12 @@ def _check_gathered(case: ProposalCase, sampler: Any) -> None:
         require(bare == 0, f"{bare} rays have no sample in the {half} half of what is kept")
 
 
-def chords(rays: Rays) -> tuple[Tensor, Tensor]:
-    """Where each ray enters and leaves the slab, [n_rays] each, to a hundredth; 0 if never."""
-    t = torch.arange(0.0, 8.0, 0.01)
+def chords(rays: Rays, scene: Slab = SLAB) -> tuple[Tensor, Tensor]:
+    """Where each ray enters and leaves the slab, [n_rays] each, to a hundredth; 0 if never. One
+    without end is left at `FAR_AWAY`."""
+    t = torch.arange(0.0, FAR_AWAY if scene.unbounded else 8.0, 0.01)
     positions = rays.origins[:, None] + rays.directions[:, None] * t[:, None]
-    inside = SLAB.depth(positions) >= 0.0
+    inside = scene.depth(positions) >= 0.0
     first, last = inside.int().argmax(dim=1), len(t) - 1 - inside.flip(1).int().argmax(dim=1)
     met = inside.any(dim=1)
     return t[first] * met, t[last] * met

@@ -29,12 +29,14 @@ from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.base import DenseEstimator
 from leco_plugin.samplers.marching import Samples
 from leco_plugin.samplers.packed import accumulate_along_rays, render_weight_from_density
-from leco_plugin.space import Space
+from leco_plugin.space import Space, contract
 
 CENTRE, HALF = (0.5, -1.0, 2.0), 1.5
 """The box: neither centred nor of unit size, so that a forgotten mapping is noticed."""
 DISTANCE = 2.0 * HALF
 """From the centre of the box to every ray's origin."""
+FAR_AWAY = 4.0 * DISTANCE
+"""From the origins of rays that leave the box to their ends."""
 STEP, LONG_STEP = 0.05, 0.25
 """World units. With long steps a ray has one or two samples in each part of `TWO`."""
 MANY = 20_000
@@ -91,6 +93,12 @@ def cut_short(n_rays: int = 48) -> Rays:
     return rays._replace(t_min=DISTANCE - 0.8 + spread, t_max=DISTANCE + 0.8 - spread)
 
 
+def leaving() -> Rays:
+    """The same rays, which go on far beyond the box."""
+    rays = crossing()
+    return rays._replace(t_max=torch.full_like(rays.t_max, FAR_AWAY))
+
+
 def stretched() -> Rays:
     """The rays of `crossing` with directions of length 2, as a host in other units has them."""
     rays = crossing()
@@ -115,18 +123,23 @@ class Slab:
         normal: of the planes, of length 1.
         half_width: in half extents of the box.
         offset: of each plane from the middle of the box, in half extents; 0 is one plane.
+        unbounded: occupied beyond the box too, within the distance in contracted space.
     """
 
     normal: tuple[float, float, float]
     half_width: float
     offset: float = 0.0
+    unbounded: bool = False
 
     def depth(self, positions: Tensor) -> Tensor:
-        """How deep positions [..., 3] lie inside, world units, [...]; negative outside."""
+        """How deep positions [..., 3] lie inside, world units, [...]; negative outside. Beyond the
+        box of an unbounded scene it is measured in contracted space, which is shorter."""
         offsets = positions - positions.new_tensor(CENTRE)
+        if self.unbounded:
+            offsets = contract(offsets / HALF) * HALF
         from_middle = (offsets @ positions.new_tensor(self.normal)).abs()
-        from_plane = (from_middle - self.offset * HALF).abs()
-        return torch.minimum(self.half_width * HALF - from_plane, HALF - offsets.abs().amax(dim=-1))
+        inside = self.half_width * HALF - (from_middle - self.offset * HALF).abs()
+        return inside if self.unbounded else inside.minimum(HALF - offsets.abs().amax(dim=-1))
 
     def density(self, positions: Tensor) -> Tensor:
         """1 inside and 0 outside: [..., 3] to [..., 1], as hosts answer."""
@@ -137,9 +150,11 @@ class Slab:
         turn, shift = frame[:, :3], frame[:, 3]
         scale = float(turn.abs().max())  # turns are by right angles
         normal = turn @ torch.tensor(self.normal) / scale
-        gate = slab_gate(normal, self.half_width, self.offset, kind)
+        share = 0.5 if self.unbounded else 1.0  # the contracted scene is twice as wide as the box
+        gate = slab_gate(normal, share * self.half_width, share * self.offset, kind)
         x, y, z = (turn @ torch.tensor(CENTRE) + shift).tolist()
-        known = Occupancy(gate, Space("box", (x, y, z), scale * HALF), threshold=0.5)
+        space = Space("contraction" if self.unbounded else "box", (x, y, z), scale * HALF)
+        known = Occupancy(gate, space, threshold=0.5)
         return known.requires_grad_(False).eval()
 
 
@@ -148,6 +163,8 @@ OTHER = Slab((0.0, 0.0, 1.0), 0.25)
 EVERYTHING = Slab((0.0, 0.0, 1.0), 100.0)
 TWO = Slab((0.48, 0.6, 0.64), 0.15, offset=0.4)
 """Two thin slabs, with a gap between them."""
+AROUND = Slab(SLAB.normal, 0.8, unbounded=True)
+"""A slab that goes on beyond the box, without end."""
 NOTHING = Slab((0.0, 0.0, 1.0), -1.0)
 """A scene in which all is empty."""
 
@@ -246,9 +263,11 @@ ROUNDING = 1e-4
 """World units that two ways to compute an edge may differ by."""
 
 
-def dense(rays: Rays, cone_angle: float = 0.0, step: float = STEP) -> Samples:
-    """Every candidate in the box, by the one ray-marching rule."""
-    return DenseEstimator(box()).sampling(
+def dense(
+    rays: Rays, cone_angle: float = 0.0, step: float = STEP, unbounded: bool = False
+) -> Samples:
+    """Every candidate by the one ray-marching rule, in the box or all along the rays."""
+    return DenseEstimator(None if unbounded else box()).sampling(
         rays.origins,
         rays.directions,
         t_min=rays.t_min,

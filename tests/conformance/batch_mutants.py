@@ -85,7 +85,9 @@ class Jittered(Sound):
         if options.get("stratified", False):
             options["stratified"] = False
             shift = options["render_step_size"] * self.shares(len(rays_o))
-            options["t_min"] = options["t_min"].clamp(min=options.get("near_plane", 0.0)) + shift
+            near = torch.full_like(shift, options.get("near_plane", 0.0))
+            begins = near if options["t_min"] is None else options["t_min"].maximum(near)
+            options["t_min"] = begins + shift
         return super().sampling(rays_o, rays_d, *args, **options)
 
     def shares(self, n_rays: int) -> Tensor:

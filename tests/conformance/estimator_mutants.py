@@ -235,12 +235,11 @@ class OutsideTheStateDict(Sound):
         self.__dict__["occupancy"] = occupancy
 
 
-class DecidesByRank(Sound):
+class DecidesByRank(Answers):
     """As what is done on the first rank alone would leave the others behind."""
 
-    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
-        options["t_min"] = options["t_min"] + 1e-5 * rank()
-        return super().sampling(rays_o, rays_d, *args, **options)
+    def change(self, ray_indices: Tensor, t_starts: Tensor, t_ends: Tensor) -> Samples:
+        return ray_indices, t_starts + 1e-5 * rank(), t_ends + 1e-5 * rank()
 
 
 def rank() -> int:
@@ -254,6 +253,30 @@ class ShortBuffer(Sound):
     def __init__(self, aabb: Tensor, occupancy: Occupancy) -> None:
         super().__init__(aabb, occupancy)
         self.register_buffer("cells", torch.zeros(8, dtype=torch.int16))
+
+
+class NeedsLimits(Sound):
+    """Reads t_min, which a host like Instant-NGP does not give."""
+
+    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
+        options["t_min"] = options["t_min"].clamp(min=options.get("near_plane", 0.0))
+        return super().sampling(rays_o, rays_d, *args, **options)
+
+
+class NearPlaneWithLimitsOnly(Sound):
+    """Rays without limits of their own begin at their origins."""
+
+    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
+        if options["t_min"] is None:
+            options["near_plane"] = 0.0
+        return super().sampling(rays_o, rays_d, *args, **options)
+
+
+class ClippedToTheBox(LearnedOccupancyEstimator):
+    """Takes the box of the host's grid for the end of the scene."""
+
+    def __init__(self, aabb: Tensor, occupancy: Occupancy) -> None:
+        super().__init__(occupancy, aabb, cache_bytes=0)
 
 
 def deaf_to(name: str, **always: Any) -> type[Sound]:
@@ -278,11 +301,23 @@ DeafToDensities = deaf_to("DeafToDensities", sigma_fn=None, alpha_fn=None)
 MUTANTS: dict[str, tuple[type, ...]] = {
     "signature": (RaysInAnotherOrder, AnotherDefault, NoTorchModule),
     "shapes-types-devices": (DoubleStarts,),
-    "sorted-disjoint-inside": (FarFirst, Overlapping, FarPlaneIgnored),
+    "sorted-disjoint-inside": (
+        FarFirst,
+        Overlapping,
+        FarPlaneIgnored,
+        NeedsLimits,
+        NearPlaneWithLimitsOnly,
+    ),
     "packing-consistent": (ShortIndices, RaysInPieces),
     "deterministic-in-eval": (AlwaysShaking,),
     "stratified-in-training": (NeverStratified, ShakenOutOfBounds),
-    "skips-only-what-it-may": (KeepsAll, KeepsTooLittle, KeepsAllInTraining, Normalises),
+    "skips-only-what-it-may": (
+        KeepsAll,
+        KeepsTooLittle,
+        KeepsAllInTraining,
+        Normalises,
+        ClippedToTheBox,
+    ),
     "all-kept-equals-dense": (DropsTheFirst, StepsOfOneLength),
     "no-gradient-to-the-gate": (GateThaws, GradientsSwitchedOff),
     "zero-samples-well-formed": (StandInSample, FloatWhenEmpty),

@@ -53,13 +53,65 @@ class FlatWeights(SoundProposal):
         return samples, [level[..., 0] for level in weights], candidates
 
 
+class Rewritten(SoundProposal):
+    """Changes the samples that are returned."""
+
+    def generate_ray_samples(self, ray_bundle: Any = None, density_fns: Any = None) -> Any:
+        samples, weights, candidates = super().generate_ray_samples(ray_bundle, density_fns)
+        self.rewrite(samples)
+        return samples, weights, candidates
+
+    def rewrite(self, samples: Any) -> None:
+        raise NotImplementedError
+
+
+class TwiceAsLong(Rewritten):
+    """Light is absorbed on twice the way."""
+
+    def rewrite(self, samples: Any) -> None:
+        samples.deltas = 2.0 * samples.deltas
+
+
+class WithoutLength(Rewritten):
+    """Nothing absorbs any light to speak of."""
+
+    def rewrite(self, samples: Any) -> None:
+        samples.deltas = 1e-3 * samples.deltas
+
+
+class OfNoCamera(Rewritten):
+    """A field finds no code for the photograph."""
+
+    def rewrite(self, samples: Any) -> None:
+        samples.camera_indices = None
+
+
+class OfOneCamera(Rewritten):
+    """All have the code of the first photograph."""
+
+    def rewrite(self, samples: Any) -> None:
+        samples.camera_indices = torch.zeros_like(samples.camera_indices)
+
+
+class OfNoTime(Rewritten):
+    def rewrite(self, samples: Any) -> None:
+        samples.times = None
+
+
+class WithoutMetadata(Rewritten):
+    def rewrite(self, samples: Any) -> None:
+        samples.metadata = None
+
+
 class Shifted(SoundProposal):
     """Changes the samples' edges [n_rays, n, 1]."""
 
     def generate_ray_samples(self, ray_bundle: Any = None, density_fns: Any = None) -> Any:
         samples, weights, candidates = super().generate_ray_samples(ray_bundle, density_fns)
         starts, ends = samples.frustums.starts, samples.frustums.ends
-        samples.frustums.starts, samples.frustums.ends = self.change(starts, ends)
+        starts, ends = self.change(starts, ends)
+        samples.frustums.starts, samples.frustums.ends = starts, ends
+        samples.deltas = ends - starts
         return samples, weights, candidates
 
     def change(self, starts: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
@@ -103,6 +155,16 @@ class FrontOnly(SoundProposal):
 class UniformInTraining(SoundProposal):
     def worth(self, positions: Tensor) -> Tensor:
         return torch.ones_like(positions[..., :1]) if self.training else super().worth(positions)
+
+
+class InTheBoxOnly(SoundProposal):
+    """Takes an unbounded scene to end where its contraction begins."""
+
+    def worth(self, positions: Tensor) -> Tensor:
+        space = self.estimator.occupancy.space
+        offsets = (self._in_its_frame(positions) - space.center).abs().amax(dim=-1)
+        inside = (offsets <= space.half_extent).view(*positions.shape[:-1], 1)
+        return super().worth(positions) * inside
 
 
 class ForgetsTheFrame(SoundProposal):
@@ -170,7 +232,16 @@ class SamplesByRank(Shifted):
 
 PROPOSAL_MUTANTS: dict[str, tuple[type, ...]] = {
     "signature": (NoCallbacks, TuplesForLists, AsksProposalNetworks),
-    "shapes-types-devices": (OneLevelOnly, FlatWeights),
+    "shapes-types-devices": (
+        OneLevelOnly,
+        FlatWeights,
+        TwiceAsLong,
+        WithoutLength,
+        OfNoCamera,
+        OfOneCamera,
+        OfNoTime,
+        WithoutMetadata,
+    ),
     "sorted-disjoint-inside": (LastFirst,),
     "deterministic-in-eval": (Shaking,),
     "stratified-in-training": (NeverShaken,),
@@ -180,6 +251,7 @@ PROPOSAL_MUTANTS: dict[str, tuple[type, ...]] = {
         UniformInTraining,
         ForgetsTheFrame,
         KnowsNoFrame,
+        InTheBoxOnly,
     ),
     "all-kept-equals-dense": (PrefersTheFront,),
     "no-gradient-to-the-gate": (ProposalThaws,),
