@@ -167,13 +167,13 @@ def sorted_disjoint_inside(case: EstimatorCase) -> None:
 def _check_between_planes(case: EstimatorCase, sampler: Any, near: float, far: float) -> None:
     """Raises unless rays without limits of their own are sampled from near plane to far plane."""
     rays = crossing()
-    planes = {"near_plane": near, "far_plane": far}
+    planes: dict[str, Any] = {"near_plane": near, "far_plane": far, **NO_LIMITS}
     ends = {"t_min": torch.full_like(rays.t_min, near), "t_max": torch.full_like(rays.t_max, far)}
     between = rays._replace(**ends)
     for training in (True, False):
         sampler.train(training)
         try:
-            found = case.sample(sampler, rays, **planes, **NO_LIMITS)
+            found = case.sample(sampler, rays, **planes)
         except Broken:
             raise
         except Exception as error:

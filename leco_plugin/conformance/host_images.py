@@ -22,7 +22,16 @@ from leco_plugin.conformance.hosts import (
 from leco_plugin.conformance.proposals import CHORD, INSIDE, NEARBY, chords
 from leco_plugin.conformance.rules import Broken, checks, require
 from leco_plugin.conformance.samplers import check_tensor, devices
-from leco_plugin.conformance.scene import DISTANCE, EVERYTHING, MARGIN, NOTHING, SLAB, Rays, box
+from leco_plugin.conformance.scene import (
+    DISTANCE,
+    EVERYTHING,
+    MARGIN,
+    NOTHING,
+    ROUNDING,
+    SLAB,
+    Rays,
+    box,
+)
 from leco_plugin.hosts.stand_ins import GuidedEstimator, GuidedProposal
 from leco_plugin.samplers.base import DenseEstimator, Estimator
 from leco_plugin.samplers.marching import Samples
@@ -41,11 +50,12 @@ def is_packed(model: Model) -> bool:
 
 
 @contextmanager
-def shaded(model: Model) -> Iterator[list[Tensor]]:
-    """While this lasts, collects positions [N, 3] at which the host asks its field.
+def shaded(model: Model) -> Iterator[tuple[list[Tensor], list[Tensor]]]:
+    """While this lasts, collects positions [N, 3] at which the host asks its field, and those of
+    the samples that its sampler returns.
 
-    A field is any `Field` of nerfstudio that is called with samples. Of a host that has none, what
-    its sampler returns is collected when this ends.
+    A field is any `Field` of nerfstudio that is called with samples. A host that has none counts as
+    asking about what its sampler returns.
     """
     from nerfstudio.cameras.rays import RaySamples
     from nerfstudio.fields.base_field import Field
@@ -63,7 +73,7 @@ def shaded(model: Model) -> Iterator[list[Tensor]]:
                 stack.enter_context(module.register_forward_pre_hook(before, with_kwargs=True))
             elif isinstance(module, GuidedEstimator | GuidedProposal):
                 stack.enter_context(_noting(module, sampled))
-        yield asked
+        yield asked, sampled
     if not asked:
         asked.extend(sampled)
 
@@ -71,10 +81,16 @@ def shaded(model: Model) -> Iterator[list[Tensor]]:
 @torch.no_grad()
 def places_asked(model: Model) -> Tensor:
     """Positions [N, 3] at which the host asks its field about the rays of `bundle`."""
-    with shaded(model) as places:
+    return _asked_and_sampled(model)[0]
+
+
+@torch.no_grad()
+def _asked_and_sampled(model: Model) -> tuple[Tensor, Tensor]:
+    """Positions [N, 3] about which the host asks, and those that its sampler returns."""
+    with shaded(model) as (asked, sampled):
         model(bundle())
-    require(bool(places), "the field is asked about no sample at all")
-    return torch.cat(places)
+    require(bool(asked), "the field is asked about no sample at all")
+    return torch.cat(asked), torch.cat(sampled)
 
 
 def positions_of(ray_samples: Any) -> Tensor:
@@ -245,7 +261,7 @@ def shades_only_what_is_kept(case: HostCase) -> None:
     require(bool((leaves - enters > CHORD).all()), "the kit's rays do not all cross its slab")
     for training, moved in ((False, False), (True, False), (False, True)):
         model = case.shared(SLAB, moved).train(training)
-        positions = places_asked(model)
+        positions, sampled = _asked_and_sampled(model)
         depths = SLAB.depth(positions)
         met = _rays_through(positions[depths > 0.0], rays.origins, rays.directions)
         bare = int((~met).sum())
@@ -254,9 +270,19 @@ def shades_only_what_is_kept(case: HostCase) -> None:
             outside = int((depths < -MARGIN).sum())
             share = f"{outside} of {len(depths)} places"
             require(outside == 0, f"the field is asked about {share} where all is empty")
+            _check_alike(positions, sampled)
         else:
             near = float((depths > -NEARBY).float().mean())
             require(near >= INSIDE, f"{near:.0%} of all samples lie in or near what is occupied")
+
+
+def _check_alike(asked: Tensor, sampled: Tensor) -> None:
+    """Raises unless the field is asked about what the sampler returns, and about nothing else."""
+    apart = torch.cdist(sampled, asked, compute_mode="donot_use_mm_for_euclid_dist")
+    lost, added = (int((apart.amin(dim=way) > ROUNDING).sum()) for way in (1, 0))
+    said = f"{lost} of {len(sampled)} samples that the sampler returns"
+    require(lost == 0, f"the field is not asked about {said}")
+    require(added == 0, f"the field is asked about {added} places that the sampler does not return")
 
 
 def _rays_through(positions: Tensor, origins: Tensor, directions: Tensor) -> Tensor:

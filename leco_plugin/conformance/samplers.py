@@ -31,6 +31,7 @@ from leco_plugin.conformance.scene import (
     crossing,
     cut_short,
     same,
+    with_gradients,
 )
 from leco_plugin.models.encodings import Kind
 from leco_plugin.occupancy import Occupancy
@@ -139,7 +140,7 @@ def check_shifts(case: SamplerCase) -> None:
 @checks("no-gradient-to-the-gate", *BOTH)
 def no_gradient_to_the_gate(case: SamplerCase) -> None:
     """A loss on rendered colours moves the host's field, and never the frozen gate."""
-    sampler, rays, field = case.shared(SLAB).train(), crossing(), Field()
+    sampler, rays, field = case.shared(SLAB).train(), with_gradients(crossing()), Field()
     colours = case.colours(sampler, rays, field)
     require(torch.is_grad_enabled(), "sampling leaves gradients switched off")
     colours.square().sum().backward()

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from conformance.estimator_mutants import Answers, rank
@@ -158,6 +159,39 @@ class SamplesElsewhere(NGPModel):
         return super().get_outputs(ray_bundle)
 
 
+class Resampled(NGPModel):
+    """Shades other samples than the sampler returns."""
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
+        original = self.sampler.forward
+
+        def forward(*args: Any, **options: Any) -> Any:
+            return self.change(*original(*args, **options))
+
+        with patch.object(self.sampler, "forward", forward):
+            return super().get_outputs(ray_bundle)
+
+    def change(self, samples: Any, ray_indices: Tensor) -> Any:
+        raise NotImplementedError
+
+
+class ShadesHalf(Resampled):
+    """Saves half of its time."""
+
+    def change(self, samples: Any, ray_indices: Tensor) -> Any:
+        return samples[::2], ray_indices[::2]
+
+
+class HalfAStepBehind(Resampled):
+    """Takes the ends of samples for their middles."""
+
+    def change(self, samples: Any, ray_indices: Tensor) -> Any:
+        half = (samples.frustums.ends - samples.frustums.starts) / 2.0
+        samples.frustums.starts = samples.frustums.starts + half
+        samples.frustums.ends = samples.frustums.ends + half
+        return samples, ray_indices
+
+
 class DividesByOpacity(NGPModel):
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
         outputs = super().get_outputs(ray_bundle)
@@ -260,6 +294,8 @@ HOST_MUTANTS: dict[str, dict[str, GuidedModelConfig]] = {
         "FillsUp": packed(FillsUp),
         "SamplesElsewhere": packed(SamplesElsewhere),
         "AsksAsItIs": packed(AsksAsItIs),
+        "ShadesHalf": packed(ShadesHalf),
+        "HalfAStepBehind": packed(HalfAStepBehind),
         "UniformHost": proposal(sampler="Uniform"),
     },
     "state-and-yaml-round-trip": {
