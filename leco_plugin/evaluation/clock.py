@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import math
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -120,9 +121,11 @@ def peak_process_bytes() -> int:
 
 
 def forget_peaks() -> bool:
-    """Makes later peaks those of what follows; returns whether the system can do so. What earlier
-    work left in memory still counts."""
+    """Makes later peaks those of what follows; returns whether the system can do so. What is still
+    in use counts."""
     gc.collect()
+    with suppress(OSError, AttributeError):  # no glibc
+        ctypes.CDLL("libc.so.6").malloc_trim(0)  # our models on a CPU keep memory that is free
     if torch.cuda.is_available():
         torch.cuda.reset_peak_memory_stats()
     try:
