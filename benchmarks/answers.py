@@ -27,7 +27,7 @@ from leco_plugin.chart.summary import RENDERING, Line, compare, lines_of, senten
 HEAD = """## The answers with their figures
 
 What each suite of `leco chart --suite` found on each scene. Costs, spread over seeds, pictures and
-commands are below; a chart marked (*) was made before a mend that is named there.
+commands are below. Where (*) stands, a chart was made before a mend that is named there.
 """
 KEPT = """Volume kept, of what rays reach, where each loses 0.1% of the surface mass, and the size
 of the occupancy: less is better in both, and what is on the front is so in the median over seeds.

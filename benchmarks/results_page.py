@@ -66,7 +66,7 @@ What was found, in one page. Behind it are [Measurements](measurements.md), ever
 with [how to read them](measurements.md#how-to-read-a-table), [Suites](suites.md), the charts of the
 reviewers' questions, and [Who gets what](gifts.md) in a comparison. All is made from
 `benchmarks/results/*.json` by `python benchmarks/results_page.py`; a test fails when they differ.
-(*) marks what older code has made; the page of its figures says what has changed since.
+Where (*) stands, older code has made the figure; the page of its figures says what has changed.
 
 ## What is gained in the same time
 """
