@@ -102,10 +102,8 @@ class EstimatorCase(SamplerCase):
 
 NEAR, FAR = 2.5, 3.4
 """Planes that cut into some of the rays of `cut_short` at either end."""
-NO_LIMITS = {"t_min": None, "t_max": None}
-"""As Instant-NGP has it: rays begin and end at the planes."""
 PLANES = ((NEAR, FAR), (0.05, 1e3))
-"""Near and far planes of such hosts; the second are those of Instant-NGP."""
+"""Near and far planes of hosts that give no t_min and t_max; the second are Instant-NGP's."""
 
 
 @checks("signature", "estimator")
@@ -167,7 +165,7 @@ def sorted_disjoint_inside(case: EstimatorCase) -> None:
 def _check_between_planes(case: EstimatorCase, sampler: Any, near: float, far: float) -> None:
     """Raises unless rays without limits of their own are sampled from near plane to far plane."""
     rays = crossing()
-    planes: dict[str, Any] = {"near_plane": near, "far_plane": far, **NO_LIMITS}
+    planes: dict[str, Any] = {"near_plane": near, "far_plane": far, "t_min": None, "t_max": None}
     ends = {"t_min": torch.full_like(rays.t_min, near), "t_max": torch.full_like(rays.t_max, far)}
     between = rays._replace(**ends)
     for training in (True, False):

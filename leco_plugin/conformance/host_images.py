@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 from unittest.mock import patch
 
 import torch
@@ -23,6 +23,7 @@ from leco_plugin.conformance.proposals import CHORD, INSIDE, NEARBY, chords
 from leco_plugin.conformance.rules import Broken, checks, require
 from leco_plugin.conformance.samplers import check_tensor, devices
 from leco_plugin.conformance.scene import (
+    AROUND,
     DISTANCE,
     EVERYTHING,
     MARGIN,
@@ -49,19 +50,24 @@ def is_packed(model: Model) -> bool:
     return any(isinstance(module, GuidedEstimator) for module in model.modules())
 
 
-@contextmanager
-def shaded(model: Model) -> Iterator[tuple[list[Tensor], list[Tensor]]]:
-    """While this lasts, collects positions [N, 3] at which the host asks its field, and those of
-    the samples that its sampler returns.
+class Places(NamedTuple):
+    """Positions [N, 3] at which a host asks its field, and of what its sampler returns."""
 
-    A field is any `Field` of nerfstudio that is called with samples. A host that has none counts as
-    asking about what its sampler returns.
+    asked: list[Tensor]
+    sampled: list[Tensor]
+
+
+@contextmanager
+def shaded(model: Model) -> Iterator[Places]:
+    """While this lasts, collects where the host asks its field, and what its sampler returns.
+
+    A field is any `Field` of nerfstudio that is called with samples. Of a host that has none, what
+    its sampler returns counts as asked when this ends.
     """
     from nerfstudio.cameras.rays import RaySamples
     from nerfstudio.fields.base_field import Field
 
-    asked: list[Tensor] = []
-    sampled: list[Tensor] = []
+    asked, sampled = places = Places([], [])
 
     def before(_: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         samples = [part for part in (*args, *kwargs.values()) if isinstance(part, RaySamples)]
@@ -73,12 +79,11 @@ def shaded(model: Model) -> Iterator[tuple[list[Tensor], list[Tensor]]]:
                 stack.enter_context(module.register_forward_pre_hook(before, with_kwargs=True))
             elif isinstance(module, GuidedEstimator | GuidedProposal):
                 stack.enter_context(_noting(module, sampled))
-        yield asked, sampled
+        yield places
     if not asked:
         asked.extend(sampled)
 
 
-@torch.no_grad()
 def places_asked(model: Model) -> Tensor:
     """Positions [N, 3] at which the host asks its field about the rays of `bundle`."""
     return _asked_and_sampled(model)[0]
@@ -86,11 +91,12 @@ def places_asked(model: Model) -> Tensor:
 
 @torch.no_grad()
 def _asked_and_sampled(model: Model) -> tuple[Tensor, Tensor]:
-    """Positions [N, 3] about which the host asks, and those that its sampler returns."""
-    with shaded(model) as (asked, sampled):
+    """The same, and the positions [M, 3] of what its sampler returns."""
+    with shaded(model) as places:
         model(bundle())
-    require(bool(asked), "the field is asked about no sample at all")
-    return torch.cat(asked), torch.cat(sampled)
+    require(bool(places.asked), "the field is asked about no sample at all")
+    require(bool(places.sampled), "the sampler is not asked")
+    return torch.cat(places.asked), torch.cat(places.sampled)
 
 
 def positions_of(ray_samples: Any) -> Tensor:
@@ -147,6 +153,8 @@ CHANNELS = {"rgb": 3, "depth": 1, "accumulation": 1}
 TOLERANCE = {True: 1e-3, False: 0.25}
 """Of a packed host, and of one with a fixed number of samples, which are few: the largest
 difference between guided by everything and dense, as a share of the largest value."""
+RELATIVE = 1e-5
+"""Of a position's distance from the origin: what two ways to compute it may differ by."""
 OPAQUE = 1e-4
 """Accumulation up to which a ray has met nothing."""
 
@@ -259,30 +267,44 @@ def shades_only_what_is_kept(case: HostCase) -> None:
     rays, along = bundle(), torch.zeros(len(bundle()))
     enters, leaves = chords(Rays(rays.origins, rays.directions, along, along + 2.0 * DISTANCE))
     require(bool((leaves - enters > CHORD).all()), "the kit's rays do not all cross its slab")
-    for training, moved in ((False, False), (True, False), (False, True)):
-        model = case.shared(SLAB, moved).train(training)
+    for training, moved, scene in (
+        (False, False, SLAB),
+        (True, False, SLAB),
+        (False, True, SLAB),
+        (False, False, AROUND),
+    ):
+        model = case.shared(scene, moved).train(training)
         positions, sampled = _asked_and_sampled(model)
-        depths = SLAB.depth(positions)
+        depths = scene.depth(positions)
         met = _rays_through(positions[depths > 0.0], rays.origins, rays.directions)
         bare = int((~met).sum())
         require(bare == 0, f"{bare} of {len(met)} rays have no sample in what is occupied")
-        if is_packed(model):
+        if not is_packed(model):
+            near = float((depths > -NEARBY).float().mean())
+            require(near >= INSIDE, f"{near:.0%} of all samples lie in or near what is occupied")
+            continue
+        if not scene.unbounded:  # where a ray ends in a backdrop, whatever is there
             outside = int((depths < -MARGIN).sum())
             share = f"{outside} of {len(depths)} places"
             require(outside == 0, f"the field is asked about {share} where all is empty")
-            _check_alike(positions, sampled)
-        else:
-            near = float((depths > -NEARBY).float().mean())
-            require(near >= INSIDE, f"{near:.0%} of all samples lie in or near what is occupied")
+        if not training:
+            _check_same_places(positions, sampled)
 
 
-def _check_alike(asked: Tensor, sampled: Tensor) -> None:
-    """Raises unless the field is asked about what the sampler returns, and about nothing else."""
-    apart = torch.cdist(sampled, asked, compute_mode="donot_use_mm_for_euclid_dist")
-    lost, added = (int((apart.amin(dim=way) > ROUNDING).sum()) for way in (1, 0))
-    said = f"{lost} of {len(sampled)} samples that the sampler returns"
-    require(lost == 0, f"the field is not asked about {said}")
-    require(added == 0, f"the field is asked about {added} places that the sampler does not return")
+def _check_same_places(asked: Tensor, sampled: Tensor) -> None:
+    """Raises unless the field is asked about each sample [M, 3], and about nothing else [N, 3]."""
+    left_out, count = int(_apart(sampled, asked).sum()), len(sampled)
+    require(left_out == 0, f"{left_out} of {count} samples that are kept are not shaded")
+    more, count = int(_apart(asked, sampled).sum()), len(asked)
+    require(more == 0, f"the field is asked about {more} of {count} places that are no samples")
+
+
+def _apart(positions: Tensor, others: Tensor) -> Tensor:
+    """Which positions [N, 3] are none of the others [M, 3], but for rounding: bool [N]."""
+    from scipy.spatial import cKDTree
+
+    distances, _ = cKDTree(others.double().numpy()).query(positions.double().numpy())
+    return torch.from_numpy(distances) > ROUNDING + RELATIVE * positions.norm(dim=-1)
 
 
 def _rays_through(positions: Tensor, origins: Tensor, directions: Tensor) -> Tensor:

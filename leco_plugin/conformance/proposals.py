@@ -174,15 +174,14 @@ def shapes_types_devices(case: ProposalCase) -> None:
 def _check_described(ray_samples: Any, rays: Any) -> None:
     """Raises unless samples carry what a field may ask of their rays."""
     metadata, numbers = ray_samples.metadata or {}, rays.metadata["numbers"]
-    described: tuple[tuple[str, Any, Tensor], ...] = (
+    for name, found, given in (
         ("camera_indices", ray_samples.camera_indices, rays.camera_indices),
         ("times", ray_samples.times, rays.times),
         ("metadata", metadata.get("numbers"), numbers),
-    )
-    for name, found, given in described:
+    ):
         require(found is not None, f"the rays have {name}, and their samples have none")
         wanted = given[:, None].expand_as(ray_samples.frustums.starts)
-        equal = found.shape == wanted.shape and bool((found == wanted).all())
+        equal = found is not None and torch.equal(found, wanted)
         require(equal, f"{name} of samples are not those of their rays")
 
 

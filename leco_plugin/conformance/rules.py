@@ -150,14 +150,17 @@ RULES = (
         "shapes-types-devices",
         "a host indexes its rays with what it gets, and multiplies it with its densities.",
         "make every tensor from those of the rays (new_zeros, to), never with a device or "
-        "type of its own; one length for all packed tensors, one number of samples for all rays.",
+        "type of its own; one length for all packed tensors, one number of samples for all rays; "
+        "make ray_samples by ray_bundle.get_ray_samples, so that deltas are ends - starts and "
+        "camera_indices, times and metadata are those of the rays (proposal).",
     ),
     Rule(
         "sorted-disjoint-inside",
         "transmittance is a running product from near to far: out of order, overlapping or "
         "outside, it counts matter twice or where there is none.",
         "hand out intervals from near to far, each begun where the last one ended or later, "
-        "with middles between t_min or near_plane and t_max or far_plane, whichever is narrower.",
+        "with middles between t_min or near_plane and t_max or far_plane, whichever is narrower; "
+        "t_min and t_max may be None, and the planes alone hold (estimator).",
     ),
     Rule(
         "packing-consistent",
@@ -184,7 +187,8 @@ RULES = (
         "though it is empty is time lost.",
         "decide by Occupancy.occupied at the middle of each candidate, origin + t direction "
         "whatever the direction's length (the occupancy maps positions itself), in training as in "
-        "evaluation; take frame=, and ask at positions that it has moved (proposal).",
+        "evaluation; do not end an unbounded scene at aabb, the box of the host's grid "
+        "(estimator); take frame=, and ask at positions that it has moved (proposal).",
     ),
     Rule(
         "all-kept-equals-dense",
@@ -198,8 +202,8 @@ RULES = (
         "no-gradient-to-the-gate",
         "the occupancy is frozen: its threshold was calibrated for the weights it has; and "
         "the field of the host must go on learning.",
-        "sample under torch.no_grad as a context, not by switching gradients off, and leave "
-        "requires_grad of the gate as it is.",
+        "sample under torch.no_grad as a context, not by switching gradients off, also where rays "
+        "need gradients, and leave requires_grad of the gate as it is.",
     ),
     Rule(
         "zero-samples-well-formed",
@@ -275,8 +279,8 @@ RULES = (
         "shades-only-what-is-kept",
         "what is shaded where all is empty is time lost, and a ray that is not shaded where "
         "something is has a hole; both happen when host and occupancy differ in coordinates.",
-        "ask the field about the samples that the sampler returns and no others, in the "
-        "coordinates of the rays that the sampler was given.",
+        "ask the field about all samples that the sampler returns and no others, beyond the "
+        "host's box too, in the coordinates of the rays that the sampler was given.",
     ),
     Rule(
         "state-and-yaml-round-trip",

@@ -31,7 +31,6 @@ from leco_plugin.conformance.scene import (
     crossing,
     cut_short,
     same,
-    with_gradients,
 )
 from leco_plugin.models.encodings import Kind
 from leco_plugin.occupancy import Occupancy
@@ -135,6 +134,12 @@ def check_shifts(case: SamplerCase) -> None:
     require(not same(one, other), "two calls in training return the same samples")
     for samples in (one, other):
         check_inside(rays, samples)
+
+
+def with_gradients(rays: Rays) -> Rays:
+    """The same rays of cameras that are optimised: origins and directions need gradients."""
+    origins, directions = (part.clone().requires_grad_() for part in rays[:2])
+    return rays._replace(origins=origins, directions=directions)
 
 
 @checks("no-gradient-to-the-gate", *BOTH)

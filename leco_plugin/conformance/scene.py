@@ -99,12 +99,6 @@ def leaving() -> Rays:
     return rays._replace(t_max=torch.full_like(rays.t_max, FAR_AWAY))
 
 
-def with_gradients(rays: Rays) -> Rays:
-    """The same rays as a host has them that optimizes poses."""
-    origins, directions = (part.clone().requires_grad_() for part in rays[:2])
-    return rays._replace(origins=origins, directions=directions)
-
-
 def stretched() -> Rays:
     """The rays of `crossing` with directions of length 2, as a host in other units has them."""
     rays = crossing()

@@ -182,13 +182,13 @@ class GradientsSwitchedOff(Sound):
         return samples
 
 
-class MovesWithItsRays(Sound):
-    """Where poses are optimized, their gradient also comes by way of the distances."""
+class CarriesAGraph(Sound):
+    """Distances are computed from origins outside of torch.no_grad."""
 
     def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
         ray_indices, t_starts, t_ends = super().sampling(rays_o, rays_d, *args, **options)
-        shift = 0.0 * rays_o.sum()
-        return ray_indices, t_starts + shift, t_ends + shift
+        nothing = 0.0 * rays_o[ray_indices].sum(dim=-1)
+        return ray_indices, t_starts + nothing, t_ends + nothing
 
 
 class StandInSample(Sound):
@@ -328,7 +328,7 @@ MUTANTS: dict[str, tuple[type, ...]] = {
         ClippedToTheBox,
     ),
     "all-kept-equals-dense": (DropsTheFirst, StepsOfOneLength),
-    "no-gradient-to-the-gate": (GateThaws, GradientsSwitchedOff, MovesWithItsRays),
+    "no-gradient-to-the-gate": (GateThaws, GradientsSwitchedOff, CarriesAGraph),
     "zero-samples-well-formed": (StandInSample, FloatWhenEmpty),
     "visibility-pruning": (StopsEarly, ShadesTheFaint, DeafToDensities),
     "update-while-frozen-is-harmless": (UpdatesByNameOnly, Learns),

@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
-from unittest.mock import patch
 
 import torch
 from conformance.estimator_mutants import Answers, rank
 from conformance.proposal_mutants import SoundProposal
+from conformance.shading_mutants import ShadesElsewhere, ShadesEverySecond, ShadesItsBoxOnly
 from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.data.datamanagers.base_datamanager import (
     DataManagerConfig,
@@ -159,39 +159,6 @@ class SamplesElsewhere(NGPModel):
         return super().get_outputs(ray_bundle)
 
 
-class Resampled(NGPModel):
-    """Shades other samples than the sampler returns."""
-
-    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
-        original = self.sampler.forward
-
-        def forward(*args: Any, **options: Any) -> Any:
-            return self.change(*original(*args, **options))
-
-        with patch.object(self.sampler, "forward", forward):
-            return super().get_outputs(ray_bundle)
-
-    def change(self, samples: Any, ray_indices: Tensor) -> Any:
-        raise NotImplementedError
-
-
-class ShadesHalf(Resampled):
-    """Saves half of its time."""
-
-    def change(self, samples: Any, ray_indices: Tensor) -> Any:
-        return samples[::2], ray_indices[::2]
-
-
-class HalfAStepBehind(Resampled):
-    """Takes the ends of samples for their middles."""
-
-    def change(self, samples: Any, ray_indices: Tensor) -> Any:
-        half = (samples.frustums.ends - samples.frustums.starts) / 2.0
-        samples.frustums.starts = samples.frustums.starts + half
-        samples.frustums.ends = samples.frustums.ends + half
-        return samples, ray_indices
-
-
 class DividesByOpacity(NGPModel):
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
         outputs = super().get_outputs(ray_bundle)
@@ -293,9 +260,10 @@ HOST_MUTANTS: dict[str, dict[str, GuidedModelConfig]] = {
     "shades-only-what-is-kept": {
         "FillsUp": packed(FillsUp),
         "SamplesElsewhere": packed(SamplesElsewhere),
+        "ShadesEverySecond": packed(ShadesEverySecond),
+        "ShadesItsBoxOnly": packed(ShadesItsBoxOnly, config=replace(PACKED, cone_angle=0.01)),
+        "ShadesElsewhere": packed(ShadesElsewhere),
         "AsksAsItIs": packed(AsksAsItIs),
-        "ShadesHalf": packed(ShadesHalf),
-        "HalfAStepBehind": packed(HalfAStepBehind),
         "UniformHost": proposal(sampler="Uniform"),
     },
     "state-and-yaml-round-trip": {

@@ -197,6 +197,15 @@ class ProposalThaws(SoundProposal):
         occupancy.gate.requires_grad_(True)
 
 
+class EdgesCarryAGraph(Rewritten):
+    """Edges are computed from origins outside of torch.no_grad."""
+
+    def rewrite(self, samples: Any) -> None:
+        nothing = 0.0 * samples.frustums.origins.sum(dim=-1, keepdim=True)
+        samples.frustums.starts = samples.frustums.starts + nothing
+        samples.frustums.ends = samples.frustums.ends + nothing
+
+
 class NothingPerNothing(SoundProposal):
     """Weights of a ray that meets nothing are 0/0."""
 
@@ -254,7 +263,7 @@ PROPOSAL_MUTANTS: dict[str, tuple[type, ...]] = {
         InTheBoxOnly,
     ),
     "all-kept-equals-dense": (PrefersTheFront,),
-    "no-gradient-to-the-gate": (ProposalThaws,),
+    "no-gradient-to-the-gate": (ProposalThaws, EdgesCarryAGraph),
     "zero-samples-well-formed": (NothingPerNothing,),
     "update-while-frozen-is-harmless": (Anneals,),
     "state-dict-round-trip": (ProposalOutsideTheStateDict,),

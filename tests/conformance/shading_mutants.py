@@ -1,0 +1,59 @@
+"""Packed hosts that shade other samples in evaluation than those that are kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from nerfstudio.cameras.rays import RayBundle, RaySamples
+from nerfstudio.models.instant_ngp import NGPModel
+from torch import Tensor
+
+
+class Shades(NGPModel):
+    """Shades some of the samples that are kept, in evaluation."""
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
+        if self.training:
+            return super().get_outputs(ray_bundle)
+        with patch.object(self.sampler, "forward", self.some(self.sampler.forward)):
+            return super().get_outputs(ray_bundle)
+
+    def some(self, sample: Callable[..., Any]) -> Callable[..., Any]:
+        def sample_some(**options: Any) -> Any:
+            samples, ray_indices = sample(**options)
+            kept = self.chosen(samples)
+            if not bool(kept.any()):  # as for rays that meet nothing
+                return samples, ray_indices
+            return samples[kept], ray_indices[kept]
+
+        return sample_some
+
+    def chosen(self, samples: RaySamples) -> Tensor:
+        """Which samples [N] are shaded: bool [N]."""
+        raise NotImplementedError
+
+
+class ShadesEverySecond(Shades):
+    def chosen(self, samples: RaySamples) -> Tensor:
+        return torch.arange(len(samples)) % 2 == 0
+
+
+class ShadesItsBoxOnly(Shades):
+    """Leaves out what lies beyond its box, as in a scene that ends there."""
+
+    def chosen(self, samples: RaySamples) -> Tensor:
+        low, high = self.scene_box.aabb.view(2, 3)
+        positions = samples.frustums.get_positions()
+        return ((positions >= low) & (positions <= high)).all(dim=-1)
+
+
+class ShadesElsewhere(Shades):
+    """Asks its field half a step behind each sample."""
+
+    def chosen(self, samples: RaySamples) -> Tensor:
+        samples.frustums.starts = samples.frustums.starts + 0.025
+        samples.frustums.ends = samples.frustums.ends + 0.025
+        return torch.ones(len(samples), dtype=torch.bool)
