@@ -7,6 +7,7 @@ samples in another way brings a `HostAdapter`.
 from __future__ import annotations
 
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -192,24 +193,31 @@ def _density_lists(host: nn.Module) -> Iterator[tuple[str, list[Any] | tuple[Any
             yield name, value
 
 
-def _proposal_networks(
-    networks: list[nn.Module], groups: dict[str, list[nn.Parameter]]
-) -> list[nn.Module]:
-    """Those networks that no parameter group trains but the groups of the first."""
+def _proposal_networks(host: Model) -> list[nn.Module]:
+    """Listed networks but the host's `field`, and but those that another parameter group trains
+    than most of them. InputError where no group trains most."""
+    listed = (density.__self__ for _, densities in _density_lists(host) for density in densities)
+    networks = [each for each in dict.fromkeys(listed) if each is not getattr(host, "field", None)]
+    groups = host.get_param_groups()
     group_of = {id(parameter): name for name, group in groups.items() for parameter in group}
-    trained = [{group_of.get(id(p)) for p in each.parameters()} - {None} for each in networks]
-    return [each for each, names in zip(networks, trained) if names <= trained[0]]
+    trained = [frozenset(group_of.get(id(p)) for p in each.parameters()) for each in networks]
+    counts = Counter(names - {None} for names in trained if names - {None}).most_common(2)
+    if len(counts) == 2 and counts[0][1] == counts[1][1]:
+        raise InputError(
+            f"{type(host).__name__} lists densities of networks in several parameter groups, and "
+            "which are its proposal networks is not known: write a HostAdapter (docs/hosts.md)"
+        )
+    most = counts[0][0] if counts else frozenset()
+    return [each for each, names in zip(networks, trained) if names - {None} <= most]
 
 
 def _remove_density_networks(host: Model) -> None:
     """Drops the proposal networks from memory, state dict and parameter groups. An empty module
     takes their places: a host may go on listing their parameters. The host's `field` stays, and so
     does what is trained in another group."""
-    field, groups = getattr(host, "field", None), host.get_param_groups()
+    networks = _proposal_networks(host)
     for name, densities in list(_density_lists(host)):
-        found = dict.fromkeys(density.__self__ for density in densities)
-        networks = _proposal_networks([each for each in found if each is not field], groups)
-        for network in networks:
-            replace_module(host, network, nn.Module())
         left = [no_density if each.__self__ in networks else each for each in densities]
         setattr(host, name, type(densities)(left))
+    for network in networks:
+        replace_module(host, network, nn.Module())

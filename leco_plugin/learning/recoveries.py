@@ -109,6 +109,7 @@ class Recoveries:
             mixture, lowered = self.mixture, self.mixture.report.get("lowered", [])
             everything = Measured(0.0, *[0.0] * 4)._asdict()
             mixture.freeze(0.0, mixture.report | everything | {"lowered": [*lowered, [step, 0.0]]})
+            self.progress.watch.nothing_since = -1
             if self.run.folder is not None:
                 leave_file(mixture.occupancy(), self.run.folder)
             say(f"step {step}: {cause}, and few steps are left: from now on nothing is skipped")

@@ -70,17 +70,19 @@ class Region(nn.Module):
         """InputError if near, far or bounds that are set by hand are not those of the region."""
         kind = "contraction" if bool(self.space.unbounded) else "box"
         asked: dict[str, tuple[Any, Tensor]] = {"near": (near, self.near), "far": (far, self.far)}
-        if kind == "box":
+        if bounds.space != "contraction":  # else they say nothing
             asked["bounds.altitudes"] = (bounds.altitudes, self.aabb[2::3])
-        same = {"bounds.space": bounds.space in ("auto", kind)} | {
-            option: now is None or torch.allclose(torch.tensor(now).to(there), there, rtol=1e-5)
+        other: dict[str, tuple[Any, Any]] = {
+            option: (now, there.tolist())
             for option, (now, there) in asked.items()
+            if now is not None and not torch.allclose(torch.tensor(now).to(there), there, rtol=1e-5)
         }
-        other = [option for option, is_same in same.items() if not is_same]
-        if other:
+        if bounds.space not in ("auto", kind):
+            other["bounds.space"] = bounds.space, kind
+        for option, (now, before) in other.items():
             raise InputError(
-                f"--pipeline.model.{other[0]} is another one than the run was begun with that is "
-                "gone on with: leave it out, or begin a new run"
+                f"--pipeline.model.{option} is {now}, and the run that is gone on with has "
+                f"{before}: leave it out, or begin a new run"
             )
 
     @torch.no_grad()

@@ -19,6 +19,7 @@ from leco_plugin.hosts.guided import GuidedHost
 from leco_plugin.hosts.guided_start import OccupancyConfig
 from leco_plugin.hosts.seams import no_density, swap_sampler
 from leco_plugin.hosts.stand_ins import GuidedEstimator, GuidedProposal
+from leco_plugin.scenes.input_error import InputError
 
 
 class Host(nn.Module):
@@ -150,6 +151,21 @@ def test_a_list_of_other_methods_stays_and_so_does_a_field_among_the_densities(g
     assert host.matter is matter and host.opinions == [no_density] * 3 + [matter.density_fn]
     assert host.alike == (no_density, matter.density_fn)
     assert not [*host.scouts.parameters(), *host.alone.parameters()]
+
+
+def test_a_field_that_is_listed_first_stays(guide: Guide):
+    host = WithHeads()
+    host.opinions.insert(0, host.opinions.pop())
+    matter = host.matter
+    swap_sampler(host, guide)
+    assert host.matter is matter and host.opinions == [matter.density_fn] + [no_density] * 3
+
+
+def test_networks_of_several_groups_alike_need_an_adapter(guide: Guide):
+    host = WithHeads()
+    host.opinions, host.alike = [host.matter.density_fn, host.scouts[0].density_fn], ()
+    with pytest.raises(InputError, match=r"several parameter groups.* HostAdapter"):
+        swap_sampler(host, guide)
 
 
 class Boxless(nerfacc.OccGridEstimator):

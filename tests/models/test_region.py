@@ -97,5 +97,8 @@ def test_a_run_that_is_gone_on_with_lies_where_it_was_begun(asked: Any, option: 
     if option is None:
         region.refuse_others(*asked)
         return
-    with pytest.raises(InputError, match=rf"--pipeline\.model\.{option} is another one than"):
+    with pytest.raises(
+        InputError,
+        match=rf"--pipeline\.model\.{option} is .*, and the run that is gone on with has",
+    ):
         region.refuse_others(*asked)

@@ -81,7 +81,7 @@ def project(cameras: Cameras, number: int, points: Tensor) -> tuple[Tensor, Tens
     y, seen = -y, ahead > 0
     if cameras.distortion_params is not None:
         params = cameras.distortion_params[number]
-        seen = seen & ~is_folded(x, y, params)
+        seen = seen & (x * x + y * y < folds_at(params))
         x, y = distort(x, y, params)
     rows = cameras.cy[number] + cameras.fy[number] * y
     columns = cameras.cx[number] + cameras.fx[number] * x
@@ -101,13 +101,14 @@ def distort(x: Tensor, y: Tensor, params: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(near, bent_x, x), torch.where(near, bent_y, y)
 
 
-def is_folded(x: Tensor, y: Tensor, params: Tensor) -> Tensor:
-    """Whether radial distortion has stopped to grow somewhere between the centre and normalised
-    image places; beyond, two places share a pixel. Bool, of the places' shape."""
-    powers = torch.arange(1, 5)
-    squares = (x * x + y * y)[..., None, None] * torch.linspace(0.05, 1.0, 20)[:, None]
-    slopes = 1.0 + ((2 * powers + 1) * params[:4] * squares**powers).sum(dim=-1)
-    return (slopes <= 0.0).any(dim=-1)
+def folds_at(params: Tensor) -> float:
+    """The square of the normalised radius from which on radial distortion (OpenCV: k1 k2 k3 k4)
+    no longer grows; beyond, two places share a pixel. Infinite where that is outside of any image.
+    """
+    powers, squares = torch.arange(1, 5), torch.linspace(0.0, 4.0, 1001)
+    slopes = 1.0 + ((2 * powers + 1) * params[:4].cpu() * squares[:, None] ** powers).sum(dim=1)
+    folded = squares[slopes <= 0.0]
+    return float(folded[0]) if len(folded) else math.inf
 
 
 def hidden(pixels: Tensor, lengths: Tensor, height: int, width: int) -> Tensor:
