@@ -288,7 +288,7 @@ class Cores:
 
 SMALL, UNGUIDED = 480 * 360 / 1e6, 5.0
 """Megapixels of a test image whose rendering is in `Cores.overhead`; see `Cores.megapixel`."""
-FAST = Cores(step=0.15, overhead=25.0, unguided=20.0, grids=140.0, megapixel=13.0)
+FAST = Cores(step=0.15, overhead=30.0, unguided=23.0, grids=140.0, megapixel=13.0)
 """An AMD EPYC with AVX-512 bfloat16; cities, and surveys of 480 x 360 pixels."""
 SLOW = Cores(step=0.45, overhead=45.0, unguided=60.0, grids=280.0, megapixel=40.0)
 """A Xeon with it at a third of that speed, whose caches are shared with other machines."""

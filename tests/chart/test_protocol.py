@@ -88,7 +88,7 @@ def test_a_run_ends_with_its_time_or_its_steps() -> None:
 def test_two_runs_at_a_time_take_half_as_long() -> None:
     alone, beside = (Protocol(100.0, at_once=count) for count in (1, 2))
     minutes = forecast_minutes([GUIDED, DENSE], alone, FAST)
-    assert minutes == pytest.approx((125.0 + 145.0) / 60.0)
+    assert minutes == pytest.approx((130.0 + 153.0) / 60.0)
     assert forecast_minutes([GUIDED, DENSE], beside, FAST) == pytest.approx(minutes / 2)
 
 
