@@ -11,6 +11,8 @@ import functools
 import inspect
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -40,11 +42,9 @@ def claim(folder: Path, checkpoints: Path, load_from: Path | None) -> str | None
     if nothing can be written there."""
     place = folder.resolve()
     if place not in _held:
-        try:
+        with writing_into(folder):
             folder.mkdir(parents=True, exist_ok=True)
             held = lock(folder)
-        except OSError as error:
-            raise unwritable(folder, error) from None
         if held is None:
             return f"another run is going on in {folder}"
         if not _held:
@@ -58,12 +58,16 @@ def claim(folder: Path, checkpoints: Path, load_from: Path | None) -> str | None
     return None
 
 
-def unwritable(folder: Path, error: OSError) -> InputError:
-    """What says in one line that a run cannot have its folder."""
-    return InputError(
-        f"nothing can be written into {folder} ({error.strerror or one_line(error)}): name another "
-        "folder with --output-dir"
-    )
+@contextmanager
+def writing_into(folder: Path) -> Iterator[None]:
+    """While something is written into a run's folder: InputError where that cannot be done."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            f"nothing can be written into {folder} ({error.strerror or one_line(error)}): name "
+            "another folder with --output-dir"
+        ) from None
 
 
 def release(folder: Path) -> None:
@@ -118,10 +122,8 @@ def keep_sizes(config: Any, model: Any, asked: Any) -> Any:
     path = config.get_base_dir() / CONFIG
     if is_first() and path.exists():  # what is not to be stored has none
         text = yaml.dump(config)
-        try:
+        with writing_into(path.parent):
             write_whole(path, lambda file: file.write(text.encode("utf8")))
-        except OSError as error:
-            raise unwritable(path.parent, error) from None
     return config
 
 
