@@ -27,7 +27,7 @@ from profile_page import profile_sections
 from readme_parts import (
     GAIN_CHART,
     GIFTS_CHART,
-    HALF_HOUR_CHART,
+    HALF_HOUR_CHARTS,
     demo_table,
     gain,
     gains,
@@ -278,15 +278,19 @@ def new_views() -> str:
 
 def half_an_hour() -> str:
     """What is left of the gain when there is time."""
-    lines, anchor = lines_of(stored(HALF_HOUR_CHART)), heading_anchor(titles()[HALF_HOUR_CHART])
-    ours, other = lines
-    ends = [f"{line.psnr:.1f} dB ({last_gain(line):+.1f})" for line in lines]
-    passed = ours.seconds_to(other.psnr)
+    parts = []
+    for place, name in HALF_HOUR_CHARTS.items():
+        ours, other = lines = lines_of(stored(name))
+        ends = [f"{line.psnr:.1f} dB ({last_gain(line):+.1f})" for line in lines]
+        passed = ours.seconds_to(other.psnr)
+        sooner = "" if passed is None else f"; the first had passed the second by {passed:.0f} s"
+        parts.append(
+            f"on {place} {ends[0]} with a learned occupancy, {ends[1]} as *{other.name}*{sooner} "
+            f"([figures](measurements.md#{heading_anchor(titles()[name])}))"
+        )
     return (
-        f"**After half an hour** of one core ([figures](measurements.md#{anchor}), one seed, so no "
-        f"verdict), LeCO has {ends[0]} with a learned occupancy, and {ends[1]} as *{other.name}*; "
-        "in brackets what the last ten minutes brought. "
-        + ("" if passed is None else f"The first had passed the second by {passed:.0f} s.")
+        "**After half an hour** of one core LeCO has, with one seed each, so without a verdict, "
+        f"{'; '.join(parts)}. In brackets what the last ten minutes brought."
     )
 
 

@@ -273,7 +273,7 @@ def test_what_is_around_the_tables_is_left_as_it_is(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(parts, "with_walk", lambda text, names: text)
     monkeypatch.setattr(parts, "gain_table", lambda chart, short: "gain")
     monkeypatch.setattr(parts, "without_gifts", lambda chart: "alone")
-    monkeypatch.setattr(parts, "after_half_an_hour", lambda chart: "late")
+    monkeypatch.setattr(parts, "after_half_an_hour", lambda: "late")
     (before, after), (begin, end) = parts.DEMO, parts.GAIN
     text = f"A\n{before}\nstale\n{after}\nB\n{begin}\n{end}\nC\n"
     expected = f"A\n{before}\ndemo\n{after}\nB\n{begin}\ngain alone late\n{end}\nC\n"
