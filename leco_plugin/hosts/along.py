@@ -183,8 +183,7 @@ class Along:
         made = before.with_gate(gate, found.threshold, report)
         self.guide.set_occupancy(made)
         self.guide.watched.evidence = {}
-        if self.run.folder is not None:
-            leave_file(made, self.run.folder)
+        leave_file(made, self.run.folder)
 
     def _hear(self, bundles: Any) -> Heard:
         """The host's weights along rays, rendered as it renders in training."""

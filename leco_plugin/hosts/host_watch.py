@@ -203,8 +203,7 @@ class HostWatch:
         now = f"lowered from {before:.4f} to {threshold:.4f}"
         nothing = "0: from now on nothing is skipped"
         say(f"step {step}: {why}; the threshold is {now if threshold > 0.0 else nothing}")
-        if self.run.folder is not None:
-            leave_file(occupancy, self.run.folder)
+        leave_file(occupancy, self.run.folder)
 
 
 def squared_errors(host: Any, bundle: Any, truth: Tensor) -> Tensor:

@@ -102,11 +102,14 @@ def advice_on(measured: Measured, steps: int, recoveries: int) -> str | None:
     )
 
 
-def leave_file(occupancy: Occupancy, folder: Path) -> None:
-    """Leaves an occupancy as `occupancy.safetensors` in a folder, made where it is missing.
+def leave_file(occupancy: Occupancy, folder: Path | None) -> None:
+    """Leaves an occupancy as `occupancy.safetensors` in the folder of a run, if it has one; made
+    where it is missing.
 
     A disk that is full is said in one line: the checkpoint holds the gate too.
     """
+    if folder is None:
+        return
     try:
         folder.mkdir(parents=True, exist_ok=True)
         occupancy.save(folder / FILE_NAME)
@@ -116,8 +119,10 @@ def leave_file(occupancy: Occupancy, folder: Path) -> None:
     note(f"wrote {folder / FILE_NAME}")
 
 
-def withdraw_file(folder: Path) -> None:
+def withdraw_file(folder: Path | None) -> None:
     """Removes the file of a gate that learns again, so that nobody is guided by it."""
+    if folder is None:
+        return
     file = folder / FILE_NAME
     try:
         file.unlink(missing_ok=True)
@@ -125,11 +130,13 @@ def withdraw_file(folder: Path) -> None:
         say(f"{file} could not be withdrawn ({error}); its gate is of no use")
 
 
-def leave_field(mixture: Mixture, folder: Path) -> None:
+def leave_field(mixture: Mixture, folder: Path | None) -> None:
     """Leaves a frozen mixture's state in a folder: about a third of a checkpoint, no optimizer.
 
     A disk that is full is said in one line; only `leco shrink` is the poorer for it.
     """
+    if folder is None:
+        return
     try:
         write_whole(folder / FIELD_FILE, lambda file: torch.save(mixture.state_dict(), file))
     except (OSError, RuntimeError) as error:  # as which torch reports a disk that is full

@@ -26,7 +26,7 @@ from leco_plugin.learning.quality import (
     kept_of_seen,
     views_in_words,
 )
-from leco_plugin.learning.recoveries import Recoveries
+from leco_plugin.learning.recoveries import KEEPS_NOTHING, Recoveries
 from leco_plugin.learning.run import Progress, Run, WatchState, keep_pace
 from leco_plugin.learning.schedule import (
     KEPT_ABOVE,
@@ -126,7 +126,7 @@ class Learner:
         if len(self.history):
             self.history.leave(folder)
         if bool(self.mixture.frozen):
-            leave_file(self.mixture.occupancy(), folder)
+            self._leave_file()
             carry_over(resumed, folder)
 
     @cached_property
@@ -276,9 +276,8 @@ class Learner:
             say(advice)
         if self.recoveries.fall_back(step, measured):
             return
-        if self.run.folder is not None:
-            leave_file(mixture.occupancy(), self.run.folder)
-            leave_field(mixture, self.run.folder)
+        self._leave_file()
+        leave_field(mixture, self.run.folder)
         if not schedule.restart and self.run.goes_on:
             self._merge()
         self._say_doubts()
@@ -333,8 +332,7 @@ class Learner:
         say(views_in_words(report))
         self.watch.state.evidence = {}  # of what guided before
         self.watch.put_off(step)
-        if self.run.folder is not None:
-            leave_file(mixture.occupancy(), self.run.folder)
+        self._leave_file()
         self.run.save(step)  # what is killed from now on goes on with the gate of the file
 
     def _merge(self) -> None:
@@ -360,35 +358,29 @@ class Learner:
         finding = self.watch.after_step(step, seconds, float(kept_any), mixture.skips)
         if finding is None:
             return
-        if finding.kind == "nothing kept":
-            self.recoveries.reopen_useless(step)
-        elif finding.kind == "beyond":
-            self._skip_less(step, finding.why)
-            if self.run.folder is not None:
-                leave_file(mixture.occupancy(), self.run.folder)
-            self.run.save(step)
+        if finding.kind == "beyond":
+            why = f"{finding.why} of skipping is beyond its bound for the field as it is now"
+            self._skip_less(step, why, float(mixture.threshold))
+        elif finding.kind == "nothing kept" and not self.recoveries.reopen_useless(step):
+            self._skip_less(step, f"{KEEPS_NOTHING}, and few steps are left", 0.0)
 
-    def _skip_less(self, step: int, why: str) -> None:
-        """Lowers the threshold until the prices are within their bounds; 0 where none is low
-        enough.
+    def _skip_less(self, step: int, why: str, below: float) -> None:
+        """Lowers the threshold below another one until the prices are within their bounds, to 0
+        where none is low enough; says why, and leaves it in the run's files."""
+        mixture, before, watched = self.mixture, float(self.mixture.threshold), self.watch.state
+        found = from_first(lambda: self.held_out.lower(below, watched.rechecks), mixture.device)
+        lowered = [*mixture.report.get("lowered", []), [step, found.threshold]]
+        mixture.freeze(found.threshold, mixture.report | found._asdict() | {"lowered": lowered})
+        watched.evidence = {}
+        now = "no threshold is low enough: from now on nothing is skipped"
+        if found.threshold > 0.0:
+            now = f"threshold {before:.4f} lowered to {found.threshold:.4f}, which {found.line}"
+        say(f"step {step}: {why}; {now}")
+        self._leave_file()
+        self.run.save(step)
 
-        Args:
-            why: the prices that are beyond.
-        """
-        mixture, before = self.mixture, float(self.mixture.threshold)
-        measured = from_first(
-            lambda: self.held_out.lower(before, self.watch.state.rechecks), mixture.device
-        )
-        lowered = [*mixture.report.get("lowered", []), [step, measured.threshold]]
-        report = mixture.report | {**measured._asdict(), "lowered": lowered}
-        mixture.freeze(measured.threshold, report)
-        self.watch.state.evidence = {}
-        now = (
-            f"threshold {before:.4f} lowered to {measured.threshold:.4f}, which {measured.line}"
-            if measured.threshold > 0.0
-            else "no threshold is low enough: from now on nothing is skipped"
-        )
-        say(f"step {step}: {why} of skipping is beyond its bound for the field as it is now; {now}")
+    def _leave_file(self) -> None:
+        leave_file(self.mixture.occupancy(), self.run.folder)
 
     def _record(self, step: int) -> None:
         """One more entry in the history of the gate, which is written each time."""

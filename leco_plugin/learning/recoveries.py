@@ -19,7 +19,7 @@ from leco_plugin.learning.collapse import (
     look,
     may_fall_back,
 )
-from leco_plugin.learning.freezing import HARDLY_ANYTHING, leave_file, withdraw_file
+from leco_plugin.learning.freezing import HARDLY_ANYTHING, withdraw_file
 from leco_plugin.learning.run import Progress, Run
 from leco_plugin.log import say
 from leco_plugin.models.compute.ranks import share
@@ -28,6 +28,8 @@ from leco_plugin.models.losses import expert_shares
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.rendering import Routing
+
+KEEPS_NOTHING = "the frozen gate keeps nothing of what the cameras see"
 
 
 class Recoveries:
@@ -97,27 +99,21 @@ class Recoveries:
         self._reopen(Collapse(cause, "useless"), step)
         return True
 
-    def reopen_useless(self, step: int) -> None:
-        """Opens a frozen gate that keeps nothing; with too few steps left to learn in, it stays
-        frozen and keeps everything.
+    def reopen_useless(self, step: int) -> bool:
+        """Opens a frozen gate that keeps nothing, if there are steps left to learn in; returns
+        whether it did so.
 
         Raises:
             GateCollapsed: it was healed as often as it may be.
         """
-        cause = "the frozen gate keeps nothing of what the cameras see"
-        if not is_enough(self._room(step)):
-            mixture, lowered = self.mixture, self.mixture.report.get("lowered", [])
-            everything = Measured(0.0, *[0.0] * 4)._asdict()
-            mixture.freeze(0.0, mixture.report | everything | {"lowered": [*lowered, [step, 0.0]]})
-            self.progress.watch.nothing_since = -1
-            if self.run.folder is not None:
-                leave_file(mixture.occupancy(), self.run.folder)
-            say(f"step {step}: {cause}, and few steps are left: from now on nothing is skipped")
-            return
-        if self.progress.recoveries >= MOST_RECOVERIES:
+        enough = is_enough(self._room(step))
+        if enough and self.progress.recoveries >= MOST_RECOVERIES:
             after = f"after {MOST_RECOVERIES} recoveries"
-            raise GateCollapsed(f"step {step}: {cause}, {after}. {REMEDY}")
-        self._reopen(Collapse(cause), step)
+            raise GateCollapsed(f"step {step}: {KEEPS_NOTHING}, {after}. {REMEDY}")
+        self.progress.watch.nothing_since = -1  # of the gate as it was
+        if enough:
+            self._reopen(Collapse(KEEPS_NOTHING), step)
+        return enough
 
     def restart_field(self) -> None:
         """Gives the field the weights of a new one, and optimizers nothing to remember."""
@@ -129,9 +125,7 @@ class Recoveries:
     def _reopen(self, collapse: Collapse, step: int) -> None:
         """Has a frozen gate learn once more, on dense samples first; its file is withdrawn."""
         self.mixture.reopen()
-        self.progress.watch.nothing_since = -1  # of a gate that is no longer frozen
-        if self.run.folder is not None:
-            withdraw_file(self.run.folder)
+        withdraw_file(self.run.folder)
         done = self._heal(collapse, torch.zeros(self.mixture.gate.head.out_features), step)
         say(f"step {step}: {collapse.cause}; the gate is opened again, {done}")
 

@@ -22,6 +22,7 @@ from leco_plugin.learning.learner import Learner
 from leco_plugin.learning.price_watch import (
     SHARE_OF_TIME,
     Evidence,
+    Finding,
     PriceWatch,
     steps_until_next,
 )
@@ -142,7 +143,8 @@ def test_the_threshold_is_lowered_to_one_within_the_bounds_or_to_none(
     mixture, watch = learner.mixture, learner.progress.watch
     watch.rechecks, watch.evidence = 3, {"lost surface mass": (9.0, 9.0, 9.0)}
     before = mixture.estimator()
-    learner._skip_less(700, "lost surface mass")
+    learner.watch.after_step = lambda *_: Finding("beyond", "lost surface mass")  # type: ignore[method-assign]
+    learner.after_step(700, 1.0, 1.0)
     assert asked == [("all rays 3", pytest.approx(0.4))]
     assert float(mixture.threshold) == pytest.approx(found)
     assert mixture.estimator() is not before
@@ -303,10 +305,19 @@ def test_a_field_that_learns_a_wire_lowers_the_threshold_until_the_wire_is_kept(
 def test_a_gate_that_keeps_nothing_near_the_end_stays_frozen_and_keeps_everything(
     watched: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    measured = Measured(0.0, 1e-9, 2e-9, 3e-9, 0.0, 4e-9, 5e-9)
+
+    def lower(below: float, seed: int) -> Measured:
+        assert below == 0.0
+        return measured
+
+    watched.learner.held_out.lower = lower
     watched.run.end = 400
     watched.kept = 0.0
     watched.go(280, 400)
     assert bool(watched.mixture.frozen) and float(watched.mixture.threshold) == 0.0
-    assert Occupancy.load(tmp_path / FILE_NAME).threshold == 0.0
-    assert watched.mixture.report["empty_fraction"] == 0.0
+    assert watched.run.saved == [380] and not watched.learner.progress.looks_collapsed
+    occupancy = Occupancy.load(tmp_path / FILE_NAME)
+    assert occupancy.threshold == 0.0 and occupancy.report["lowered"] == [[380, 0.0]]
+    assert occupancy.report.items() >= measured._asdict().items(), "prices are as measured"
     assert "keeps nothing of what the cameras see, and" in " ".join(capsys.readouterr().out.split())
