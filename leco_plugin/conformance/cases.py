@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import torch
-
 from leco_plugin.conformance import (  # noqa: F401 (checks that are registered)
     host_images,
     host_training,
@@ -14,7 +12,7 @@ from leco_plugin.conformance import (  # noqa: F401 (checks that are registered)
 from leco_plugin.conformance.estimators import EstimatorCase
 from leco_plugin.conformance.hosts import HostCase
 from leco_plugin.conformance.proposals import ProposalCase
-from leco_plugin.conformance.rules import RULES, Case, Rule, Verdict, apply
+from leco_plugin.conformance.rules import RULES, Case, Rule, Verdict, apply, left_as_before
 from leco_plugin.conformance.samplers import SamplerCase
 from leco_plugin.conformance.scene import SLAB
 from leco_plugin.samplers.registry import GROUP, SamplerSpec, sampler_spec, samplers, why_left_out
@@ -44,7 +42,7 @@ def _refuse_what_cannot_be_built(case: SamplerCase) -> None:
     """One line about a builder, instead of one a rule with remedies for something else."""
     occupancy = SLAB.occupancy(case.gate_encoding) if case.needs_occupancy else None
     try:
-        with torch.random.fork_rng(devices=[]), torch.enable_grad():
+        with left_as_before():
             case.build(occupancy)
     except Exception as error:
         raise ValueError(

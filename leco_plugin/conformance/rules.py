@@ -7,7 +7,8 @@ Checks are registered with `checks(RULE, SEAM)` where they are written: `estimat
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -123,13 +124,19 @@ def _place(error: Exception) -> str:
     return ""
 
 
-def apply(rule: Rule, case: Case) -> Verdict:
-    """Whether `rule` holds for `case`, whose seam it must have a check for.
+@contextmanager
+def left_as_before() -> Iterator[None]:
+    """With gradients. torch's gradient mode and random states, also those of all cards, are as
+    before afterwards."""
+    cards = range(torch.cuda.device_count())  # `torch.manual_seed` seeds them all
+    with torch.random.fork_rng(cards), torch.enable_grad():
+        yield
 
-    torch's random state and gradient mode are as before afterwards, whatever the case did to them.
-    """
+
+def apply(rule: Rule, case: Case) -> Verdict:
+    """Whether `rule` holds for `case`, whose seam it must have a check for."""
     error = None
-    with torch.random.fork_rng(devices=[]), torch.enable_grad():
+    with left_as_before():
         try:
             rule.checks[case.seam](case)
         except Exception as caught:  # noqa: BLE001 (whatever a foreign sampler raises)

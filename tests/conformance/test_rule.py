@@ -84,3 +84,20 @@ def test_random_numbers_and_gradients_are_as_before():
     with torch.no_grad():
         apply(rule(meddles), Case())
         assert not torch.is_grad_enabled()
+
+
+def test_random_numbers_of_all_cards_are_as_before(monkeypatch):
+    fork, kept = torch.random.fork_rng, []
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(torch.random, "fork_rng", lambda cards: kept.extend(cards) or fork([]))
+    assert apply(rule(lambda case: torch.manual_seed(5)), Case()).passed
+    assert kept == [0, 1]
+
+
+@pytest.mark.gpu
+def test_a_card_draws_the_same_numbers_whatever_a_case_has_seeded():
+    torch.manual_seed(1)
+    expected = torch.rand(3, device="cuda")
+    torch.manual_seed(1)
+    apply(rule(lambda case: torch.manual_seed(5)), Case())
+    assert torch.rand(3, device="cuda").equal(expected)
