@@ -19,6 +19,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from numpy.typing import NDArray
 from torch import Tensor
 
+from leco_plugin.scenes.bounds import FEWEST_POINTS
 from leco_plugin.scenes.input_error import InputError
 
 
@@ -241,7 +242,7 @@ def check_poses(poses: NDArray[np.floating], names: list[str]) -> None:
 # Structure from motion does not know what is down, and nerfstudio takes the photographs' top edges
 # for up: of cameras that look straight down these are level, and point in any direction.
 
-FEWEST_CAMERAS, FEWEST_POINTS = 4, 32
+FEWEST_CAMERAS = 4
 DOWN, MOSTLY = -0.3, 0.9
 """Height of a unit vector that goes down, and the share of cameras of a survey that look so."""
 ABOVE = 0.75

@@ -10,6 +10,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
+from leco_plugin.scenes.bounds import FEWEST_POINTS
 from leco_plugin.scenes.pixels.held_out_pixels import (
     HeldOutPixelSampler,
     HeldOutPixelSamplerConfig,
@@ -22,7 +23,6 @@ NEARER = 0.9
 """A point hides its neighbours in the image that are farther than it by more than this factor."""
 POINTS_PER_CELL = 2.0
 """Points that share a cell of the coarse depth map, on average."""
-FEWEST_POINTS = 32
 MOST_POINTS = 50_000
 """Of a larger cloud so many points are drawn: 5 ms for each image."""
 MOST_PIXELS = 4_000_000

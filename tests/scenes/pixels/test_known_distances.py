@@ -8,10 +8,10 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
+from leco_plugin.scenes.bounds import FEWEST_POINTS
 from leco_plugin.scenes.pixels.held_out_pixels import Lattice
 from leco_plugin.scenes.pixels.known_distances import (
     DISTANCE,
-    FEWEST_POINTS,
     KnownDistancePixelSampler,
     KnownDistancePixelSamplerConfig,
     SparsePixels,
