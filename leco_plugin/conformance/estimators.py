@@ -7,12 +7,13 @@ from itertools import zip_longest
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from leco_plugin.conformance.rules import Broken, checks, require
+from leco_plugin.conformance.rules import checks, raises_nothing, require
 from leco_plugin.conformance.samplers import (
     SamplerCase,
     check_gradients,
+    check_module,
     check_shifts,
     check_tensor,
     devices,
@@ -110,9 +111,7 @@ PLANES = ((NEAR, FAR), (0.05, 1e3))
 def signature(case: EstimatorCase) -> None:
     """The two verbs take nerfacc's arguments in nerfacc's order with nerfacc's defaults."""
     sampler = case.shared(SLAB)
-    require(isinstance(sampler, nn.Module), f"it is a {type(sampler).__name__}, no torch module")
-    for verb in ("sampling", "update_every_n_steps"):
-        require(callable(getattr(sampler, verb, None)), f"it has no method {verb}")
+    check_module(sampler, "sampling", "update_every_n_steps")
     offered = list(inspect.signature(sampler.sampling).parameters.values())
     takes_anything = {inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD}
     if not takes_anything <= {parameter.kind for parameter in offered}:
@@ -122,10 +121,8 @@ def signature(case: EstimatorCase) -> None:
                 break
             fits = found is not None and (found.name, found.default) == (given.name, given.default)
             require(fits, f"argument {number} of sampling is {found}, hosts give '{given}'")
-    try:
+    with raises_nothing("update_every_n_steps(step=, occ_eval_fn=):"):
         inspect.signature(sampler.update_every_n_steps).bind(step=0, occ_eval_fn=SLAB.density)
-    except TypeError as error:
-        raise Broken(f"update_every_n_steps(step=, occ_eval_fn=): {error}") from None
 
 
 @checks("shapes-types-devices", "estimator")
@@ -170,13 +167,8 @@ def _check_between_planes(case: EstimatorCase, sampler: Any, near: float, far: f
     between = rays._replace(**ends)
     for training in (True, False):
         sampler.train(training)
-        try:
+        with raises_nothing("sampling without t_min and t_max raises"):
             found = case.sample(sampler, rays, **planes)
-        except Broken:
-            raise
-        except Exception as error:
-            said = f"{type(error).__name__}: {error}"
-            raise Broken(f"sampling without t_min and t_max raises {said}") from error
         check_intervals(between, found)
     expected = case.sample(sampler, between)
     apart = int((~among(expected, found)).sum() + (~among(found, expected)).sum())
@@ -352,11 +344,8 @@ def update_while_frozen_is_harmless(case: EstimatorCase) -> None:
         ("step, occ_eval_fn and all options", (304, answer), thresholds),
     )
     for form, arguments, options in forms:
-        try:
+        with raises_nothing(f"update_every_n_steps({form}) raises"):
             sampler.update_every_n_steps(*arguments, **options)
-        except Exception as error:  # noqa: PERF203
-            said = f"{type(error).__name__}: {error}"
-            raise Broken(f"update_every_n_steps({form}) raises {said}") from error
     after = case.sample(sampler.eval(), rays)
     if case.needs_occupancy:
         require(same(before, after), "updates with an empty field changed what is sampled")

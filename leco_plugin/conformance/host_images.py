@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 
 import torch
@@ -20,7 +20,7 @@ from leco_plugin.conformance.hosts import (
     turned_away,
 )
 from leco_plugin.conformance.proposals import CHORD, INSIDE, NEARBY, chords
-from leco_plugin.conformance.rules import Broken, checks, require
+from leco_plugin.conformance.rules import checks, raises_nothing, require
 from leco_plugin.conformance.samplers import check_tensor, devices
 from leco_plugin.conformance.scene import (
     AROUND,
@@ -50,24 +50,19 @@ def is_packed(model: Model) -> bool:
     return any(isinstance(module, GuidedEstimator) for module in model.modules())
 
 
-class Places(NamedTuple):
-    """Positions [N, 3] at which a host asks its field, and of what its sampler returns."""
-
-    asked: list[Tensor]
-    sampled: list[Tensor]
-
-
-@contextmanager
-def shaded(model: Model) -> Iterator[Places]:
-    """While this lasts, collects where the host asks its field, and what its sampler returns.
+@torch.no_grad()
+def asked_and_sampled(model: Model) -> tuple[Tensor, Tensor]:
+    """Positions [N, 3] at which a host asks its field about the rays of `bundle`, and those [M, 3]
+    of what its sampler returns.
 
     A field is any `Field` of nerfstudio that is called with samples. Of a host that has none, what
-    its sampler returns counts as asked when this ends.
+    its sampler returns counts as asked.
     """
     from nerfstudio.cameras.rays import RaySamples
     from nerfstudio.fields.base_field import Field
 
-    asked, sampled = places = Places([], [])
+    asked: list[Tensor] = []
+    sampled: list[Tensor] = []
 
     def before(_: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         samples = [part for part in (*args, *kwargs.values()) if isinstance(part, RaySamples)]
@@ -79,24 +74,10 @@ def shaded(model: Model) -> Iterator[Places]:
                 stack.enter_context(module.register_forward_pre_hook(before, with_kwargs=True))
             elif isinstance(module, GuidedEstimator | GuidedProposal):
                 stack.enter_context(_noting(module, sampled))
-        yield places
-    if not asked:
-        asked.extend(sampled)
-
-
-def places_asked(model: Model) -> Tensor:
-    """Positions [N, 3] at which the host asks its field about the rays of `bundle`."""
-    return _asked_and_sampled(model)[0]
-
-
-@torch.no_grad()
-def _asked_and_sampled(model: Model) -> tuple[Tensor, Tensor]:
-    """The same, and the positions [M, 3] of what its sampler returns."""
-    with shaded(model) as places:
         model(bundle())
-    require(bool(places.asked), "the field is asked about no sample at all")
-    require(bool(places.sampled), "the sampler is not asked")
-    return torch.cat(places.asked), torch.cat(places.sampled)
+    require(bool(asked or sampled), "the field is asked about no sample at all")
+    require(bool(sampled), "the sampler is not asked")
+    return torch.cat(asked or sampled), torch.cat(sampled)
 
 
 def positions_of(ray_samples: Any) -> Tensor:
@@ -187,12 +168,9 @@ def _check_picture(name: str, image: Tensor) -> None:
     from nerfstudio.utils.colormaps import apply_colormap, apply_depth_colormap
 
     draw = apply_depth_colormap if "depth" in name else apply_colormap
-    try:
+    what = f"{image.dtype} with {image.shape[-1]} channels"
+    with raises_nothing(f"no picture can be made of the output {name!r}, {what}:"):
         draw(image)
-    except Exception as error:
-        what = f"{image.dtype} with {image.shape[-1]} channels"
-        said = f"{type(error).__name__} {error}".strip()
-        raise Broken(f"no picture can be made of the output {name!r}, {what}: {said}") from error
 
 
 @checks("same-image-in-eval", "host")
@@ -274,7 +252,7 @@ def shades_only_what_is_kept(case: HostCase) -> None:
         (False, False, AROUND),
     ):
         model = case.shared(scene, moved).train(training)
-        positions, sampled = _asked_and_sampled(model)
+        positions, sampled = asked_and_sampled(model)
         depths = scene.depth(positions)
         met = _rays_through(positions[depths > 0.0], rays.origins, rays.directions)
         bare = int((~met).sum())

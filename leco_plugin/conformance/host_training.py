@@ -16,7 +16,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from leco_plugin.conformance.host_images import places_asked, rendered, sample_densely
+from leco_plugin.conformance.host_images import asked_and_sampled, rendered, sample_densely
 from leco_plugin.conformance.hosts import (
     HostCase,
     batch,
@@ -47,7 +47,7 @@ def samples_shift_in_training(case: HostCase) -> None:
     places = []
     for seed in (1, 2):
         torch.manual_seed(seed)
-        places.append(places_asked(model))
+        places.append(asked_and_sampled(model)[0])
     alike = places[0].equal(places[1])
     require(not alike, "two training steps ask the field at the same places")
 

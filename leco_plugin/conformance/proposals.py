@@ -5,12 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from leco_plugin.conformance.rules import Broken, checks, require
 from leco_plugin.conformance.samplers import (
     SamplerCase,
     check_gradients,
+    check_module,
     check_shifts,
     check_tensor,
     devices,
@@ -137,9 +138,7 @@ UNEVEN = 1.5
 def signature(case: ProposalCase) -> None:
     """A module with the call and the two callbacks of nerfstudio's `ProposalNetworkSampler`."""
     sampler = case.shared(SLAB)
-    require(isinstance(sampler, nn.Module), f"it is a {type(sampler).__name__}, no torch module")
-    for callback in ("set_anneal", "step_cb"):
-        require(callable(getattr(sampler, callback, None)), f"it has no method {callback}")
+    check_module(sampler, "set_anneal", "step_cb")
     density = no_density if case.needs_occupancy else None
     ray_samples, weights, candidates = case.answer(sampler, crossing(), density=density)
     found = type(ray_samples).__name__

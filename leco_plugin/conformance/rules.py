@@ -32,6 +32,17 @@ def require(holds: bool, problem: str) -> None:
         raise Broken(problem)
 
 
+@contextmanager
+def raises_nothing(what: str) -> Iterator[None]:
+    """`Broken` for whatever is raised meanwhile; `what` begins its message."""
+    try:
+        yield
+    except Broken:
+        raise
+    except Exception as error:
+        raise Broken(f"{what} {type(error).__name__}: {error}") from error
+
+
 class Case:
     """A sampler or a method, known by name, at one of the seams of a host."""
 

@@ -105,6 +105,13 @@ def devices() -> list[torch.device]:
     return [torch.device(name) for name in ("cpu", *cuda)]
 
 
+def check_module(sampler: Any, *methods: str) -> None:
+    """Raises unless a sampler is a torch module with these methods."""
+    require(isinstance(sampler, nn.Module), f"it is a {type(sampler).__name__}, no torch module")
+    for method in methods:
+        require(callable(getattr(sampler, method, None)), f"it has no method {method}")
+
+
 def check_tensor(name: str, tensor: Tensor, rays: Tensor) -> None:
     """Raises unless a tensor is finite, and of the type and on the device of the rays."""
     require(tensor.dtype == rays.dtype, f"{name} is {tensor.dtype}, the rays are {rays.dtype}")
@@ -136,16 +143,12 @@ def check_shifts(case: SamplerCase) -> None:
         check_inside(rays, samples)
 
 
-def with_gradients(rays: Rays) -> Rays:
-    """The same rays of cameras that are optimised: origins and directions need gradients."""
-    origins, directions = (part.clone().requires_grad_() for part in rays[:2])
-    return rays._replace(origins=origins, directions=directions)
-
-
 @checks("no-gradient-to-the-gate", *BOTH)
 def no_gradient_to_the_gate(case: SamplerCase) -> None:
     """A loss on rendered colours moves the host's field, and never the frozen gate."""
-    sampler, rays, field = case.shared(SLAB).train(), with_gradients(crossing()), Field()
+    sampler, field = case.shared(SLAB).train(), Field()
+    optimised = (part.clone().requires_grad_() for part in crossing()[:2])  # as cameras may be
+    rays = Rays(*optimised, *crossing()[2:])
     colours = case.colours(sampler, rays, field)
     require(torch.is_grad_enabled(), "sampling leaves gradients switched off")
     colours.square().sum().backward()
