@@ -22,7 +22,7 @@ from torch import Tensor
 
 from leco_plugin.evaluation.clock import peak_process_bytes
 from leco_plugin.learning.calibration import CalibrationConfig, Measured, calibrate
-from leco_plugin.learning.dense import Reference, reference_of
+from leco_plugin.learning.dense import DenseRendering, Reference, reference_of
 from leco_plugin.learning.schedule import ScheduleConfig, ramp
 from leco_plugin.models.field import HMoEField
 from leco_plugin.models.gate import Gate
@@ -177,7 +177,8 @@ class Run:
             return self.shaded(rays[number], kept).rgb
 
         truths = [chunk.colors for chunk in chunks]
-        measured = calibrate(references, truths, render_kept, CalibrationConfig())
+        rendering = DenseRendering(references, truths, render_kept)
+        measured = calibrate(rendering, CalibrationConfig())
         self.end_learning()
         self.gate.requires_grad_(False)
         box = self.scene.box

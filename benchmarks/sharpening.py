@@ -111,7 +111,7 @@ def taught_by(source: Source, mixture: Mixture) -> dict[str, Any]:
         assert found is not None
         seconds = time.process_time() - started
         small = partial(mixture.occupancies, gate=found.gate)
-        after = measure(*on_tests.asked(small), found.measured.threshold)
+        after = measure(on_tests.asked(small), found.measured.threshold)
         rows.append(
             {"seconds": round(seconds, 1), "held_out": shown(found.measured), "test": shown(after)}
         )
@@ -119,12 +119,12 @@ def taught_by(source: Source, mixture: Mixture) -> dict[str, Any]:
         lesson = lesson_by(mixture, taught, losses, 1.0, 1024)
         of_seed = {}
         for name, (_, score) in grids_of(mixture, lesson).items():
-            measured = calibrate(*on_held_out.asked(score), calibration)
-            after = measure(*on_tests.asked(score), measured.threshold)
+            measured = calibrate(on_held_out.asked(score), calibration)
+            after = measure(on_tests.asked(score), measured.threshold)
             of_seed[name] = {"held_out": shown(measured), "test": shown(after)}
         grids.append(of_seed)
     routing = partial(mixture.occupancies, gate=mixture.gate)
-    before = measure(*on_tests.asked(routing), float(mixture.threshold))
+    before = measure(on_tests.asked(routing), float(mixture.threshold))
     first = {"held_out": shown(found.before), "test": shown(before)}
     return {"before": first, "small": rows, "grids": grids}
 

@@ -27,7 +27,7 @@ from leco_plugin.learning.calibration import (
     image_price,
     measure,
 )
-from leco_plugin.learning.dense import Reference, evaluating, near_surface_by
+from leco_plugin.learning.dense import DenseRendering, Reference, evaluating, near_surface
 from leco_plugin.learning.freezing import leave_file
 from leco_plugin.learning.run import Run
 from leco_plugin.learning.sharpening import (
@@ -106,7 +106,7 @@ class Heard(NamedTuple):
         of_ray = self.intervals.ray_indices
         accumulation = accumulate_along_rays(self.weights, None, of_ray, self.rays)[:, 0]
         packed_info = pack_info(of_ray, self.rays)
-        near = near_surface_by(self.weights, accumulation, packed_info, self.intervals, nothing)
+        near = near_surface(self.weights, accumulation, packed_info, self.intervals, nothing)
         rgb = self.weights.new_zeros(self.rays, 3)
         return Reference(self.intervals, self.weights, occupancies, near, rgb, nothing)
 
@@ -243,13 +243,14 @@ class Along:
         asked = before.with_gate(gate, THRESHOLDS[0], {})
         with torch.no_grad():
             reference = heard.reference(asked.of_mapped(heard.mapped))
-        nothing = [truth.new_zeros(heard.rays, 3)]
+        nothing = truth.new_zeros(heard.rays, 3)
+        rendering = DenseRendering([reference], [nothing], lambda *_: nothing)
         errors = self._errors(bundle, truth)
         number = 0
         try:
             while number < len(THRESHOLDS):
                 threshold = THRESHOLDS[number]
-                found = measure([reference], nothing, lambda *_: nothing[0], threshold, False)
+                found = measure(rendering, threshold, with_image=False)
                 if not found._replace(image_price_db=0.0, price_error_db=0.0).within(config):
                     number += 1
                     continue

@@ -7,14 +7,14 @@ The reference is a dense rendering. Skipping every sample with o(x) < tau loses 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from leco_plugin.learning.dense import Reference
+from leco_plugin.learning.dense import DenseRendering, Reference
 from leco_plugin.samplers.packed import accumulate_along_rays
 from leco_plugin.scenes.input_error import require
 
@@ -120,9 +120,9 @@ def worst_loss(cameras: Sequence[Reference], threshold: float) -> float:
     """
     losses = [0.0]
     for reference in cameras:
-        on_surface = reference.weights * reference.near_surface
-        gone = (reference.occupancies < threshold) & ~reference.always_kept
-        losses.append(float((on_surface * gone).sum()) / max(float(on_surface.sum()), 1e-12))
+        surface = reference.surface_weights
+        lost = float((surface * reference.skipped(threshold)).sum())
+        losses.append(lost / max(float(surface.sum()), 1e-12))
     return max(losses)
 
 
@@ -171,35 +171,29 @@ class RayPrices(NamedTuple):
 
 
 def ray_prices(
-    references: list[Reference],
-    truths: list[Tensor],
-    render_kept: Callable[[int, Tensor], Tensor],
-    threshold: float,
-    with_image: bool = True,
-    missed_only: bool = False,
+    rendering: DenseRendering, threshold: float, with_image: bool = True, missed_only: bool = False
 ) -> RayPrices:
     """Prices of skipping below `threshold`, ray by ray; arguments as for `measure`."""
     found: list[Tensor] = []
     skipped = candidates = 0
-    for i, (reference, truth) in enumerate(zip(references, truths)):
-        gone = (reference.occupancies < threshold) & ~reference.always_kept
-        on_surface = reference.weights * reference.near_surface
+    for i, (reference, truth) in enumerate(zip(rendering.references, rendering.truths)):
+        gone, ray_indices = reference.skipped(threshold), reference.intervals.ray_indices
+        on_surface = reference.surface_weights
         lost_on_surface = on_surface * gone
         skipped, candidates = skipped + int(gone.sum()), candidates + len(gone)
         dense_error = gated_error = truth.new_zeros(len(truth))
         if with_image:
-            gated = render_kept(i, ~gone)
             dense_error = (reference.rgb - truth).square().sum(dim=-1)
-            gated_error = (gated - truth).square().sum(dim=-1)
+            gated_error = (rendering.render_kept(i, ~gone) - truth).square().sum(dim=-1)
             if missed_only:
-                lost_on_surface = lost_on_surface * is_missed(
-                    reference, i, gone, gated, truth, render_kept
-                )
+                with_surfaces = rendering.render_kept(i, ~gone | reference.near_surface)
+                better = (with_surfaces - truth).square().sum(dim=-1) < gated_error
+                lost_on_surface = lost_on_surface * better[ray_indices]
         samples = [on_surface, lost_on_surface, reference.weights * gone, reference.weights]
         of_rays = accumulate_along_rays(
             torch.ones_like(reference.weights),
             torch.stack(samples, dim=-1),
-            reference.intervals.ray_indices,
+            ray_indices,
             len(truth),
         )
         found.append(torch.stack([*of_rays.unbind(dim=-1), dense_error, gated_error]).double())
@@ -211,29 +205,25 @@ def ray_prices(
 
 
 def measure(
-    references: list[Reference],
-    truths: list[Tensor],
-    render_kept: Callable[[int, Tensor], Tensor],
-    threshold: float,
-    with_image: bool = True,
-    missed_only: bool = False,
+    rendering: DenseRendering, threshold: float, with_image: bool = True, missed_only: bool = False
 ) -> Measured:
     """What skipping below `threshold` costs and saves.
 
     Args:
-        references: dense renderings of chunks of rays.
-        truths: their true pixels, [R, 3] each.
-        render_kept: renders chunk i with only the samples of a mask [M]: returns [R, 3].
         with_image: whether to render at all; the image price is NaN otherwise.
-        missed_only: count as lost only what the photographs miss, see `is_missed`; with an image.
+        missed_only: count as lost only what lies on rays whose pixel is better rendered with what
+            is lost near surfaces; with an image. Guided training never corrects the field where the
+            gate skips, so haze may stand there. Only the photographs can tell it from a surface
+            that is missing. A loss that the field has since painted over no longer shows in the
+            error: it is found soon after freezing or not at all.
     """
-    rays = ray_prices(references, truths, render_kept, threshold, with_image, missed_only)
+    rays = ray_prices(rendering, threshold, with_image, missed_only)
     surface = max(float(rays.surface.sum()), 1e-12)
     lost_surface = float(rays.lost_surface.sum()) / surface
     price = price_error = float("nan")
     if with_image and len(rays.weight):
         price, price_error = image_price(
-            rays.gated_error, rays.dense_error, EXACT * sum(truth.numel() for truth in truths)
+            rays.gated_error, rays.dense_error, EXACT * sum(map(torch.numel, rendering.truths))
         )
     return Measured(
         threshold,
@@ -246,18 +236,11 @@ def measure(
     )
 
 
-def backdrop_price(
-    references: list[Reference],
-    truths: list[Tensor],
-    render_kept: Callable[[int, Tensor], Tensor],
-) -> float:
-    """What an image loses without its backdrop, dB of PSNR: nothing where all rays meet a ground.
-
-    Arguments as for `measure`.
-    """
+def backdrop_price(rendering: DenseRendering) -> float:
+    """What an image loses without its backdrop, dB of PSNR: 0 where all rays meet a ground."""
     dense = without = floor = 0.0
-    for i, (reference, truth) in enumerate(zip(references, truths)):
-        rgb = render_kept(i, ~reference.always_kept)
+    for i, (reference, truth) in enumerate(zip(rendering.references, rendering.truths)):
+        rgb = rendering.render_kept(i, ~reference.always_kept)
         dense += float((reference.rgb - truth).square().sum(dtype=torch.float64))
         without += float((rgb - truth).square().sum(dtype=torch.float64))
         floor += EXACT * truth.numel()
@@ -287,34 +270,6 @@ def price_db(error: float, of_dense: float, floor: float) -> float:
     return 10.0 * math.log10((error + floor) / (of_dense + floor))
 
 
-def is_missed(
-    reference: Reference,
-    number: int,
-    gone: Tensor,
-    gated: Tensor,
-    truth: Tensor,
-    render_kept: Callable[[int, Tensor], Tensor],
-) -> Tensor:
-    """Which samples lie on rays whose pixel is better rendered with what is lost near surfaces.
-
-    Guided training never corrects the field where the gate skips, so haze may stand there. Only
-    the photographs can tell that haze from a surface that is missing. A loss that the field has
-    since painted over no longer shows in the error: it is found soon after freezing or not at all.
-
-    Args:
-        number: of the chunk of rays.
-        gone: [M] bool, skipped.
-        gated: [R, 3] rendered without those.
-        truth: [R, 3].
-        render_kept: as of `measure`.
-    Returns:
-        [M] bool.
-    """
-    with_surfaces = render_kept(number, ~gone | reference.near_surface)
-    errors = [(image - truth).square().sum(dim=-1) for image in (with_surfaces, gated)]
-    return (errors[0] < errors[1])[reference.intervals.ray_indices]
-
-
 def thresholds_below(threshold: float) -> list[float]:
     """Those of `THRESHOLDS` that are lower, the highest first. A threshold that was kept in float32
     may come back a little above the one that it was; that one is not lower."""
@@ -322,9 +277,7 @@ def thresholds_below(threshold: float) -> list[float]:
 
 
 def calibrate(
-    references: list[Reference],
-    truths: list[Tensor],
-    render_kept: Callable[[int, Tensor], Tensor],
+    rendering: DenseRendering,
     config: CalibrationConfig,
     below: float = 1.0,
     missed_only: bool = False,
@@ -339,23 +292,22 @@ def calibrate(
         cameras: dense renderings of photographs that vouch. By the threshold none of them loses
             too much, see `worst_loss`, where that keeps no more than `MORE_KEPT` times as much.
     """
-    parts, best = (references, truths, render_kept), None
+    best = None
     for threshold in thresholds_below(below):
         beyond = worst_loss(cameras, threshold) > config.camera_surface_mass
         if best is not None and beyond:
             continue
         if not missed_only:
-            cheap = measure(*parts, threshold, with_image=False)
+            cheap = measure(rendering, threshold, with_image=False)
             if not cheap._replace(image_price_db=0.0, price_error_db=0.0).within(config):
                 continue
-        measured = measure(*parts, threshold, missed_only=missed_only)
+        measured = measure(rendering, threshold, missed_only=missed_only)
         if not measured.within(config):
             continue
         if not beyond:
-            if best is None or 1.0 - measured.empty_fraction <= MORE_KEPT * (
-                1.0 - best.empty_fraction
-            ):
+            kept = 1.0 - measured.empty_fraction
+            if best is None or kept <= MORE_KEPT * (1.0 - best.empty_fraction):
                 return measured
             return best
         best = measured
-    return measure(references, truths, render_kept, 0.0) if best is None else best
+    return measure(rendering, 0.0) if best is None else best

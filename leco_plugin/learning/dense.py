@@ -38,6 +38,15 @@ class Reference(NamedTuple):
     always_kept: Tensor
     """[M] bool: the backdrop, which no threshold skips."""
 
+    @property
+    def surface_weights(self) -> Tensor:
+        """[M] the weights near surfaces, 0 elsewhere."""
+        return self.weights * self.near_surface
+
+    def skipped(self, threshold: float) -> Tensor:
+        """[M] bool: what skipping below a threshold leaves out."""
+        return (self.occupancies < threshold) & ~self.always_kept
+
 
 def reference_of(shaded: Shaded, intervals: Intervals, rays: Rays) -> Reference:
     """The reference that a rendering of all candidates of some rays is."""
@@ -46,36 +55,34 @@ def reference_of(shaded: Shaded, intervals: Intervals, rays: Rays) -> Reference:
         intervals,
         shaded.weights,
         occupancy_from_logits(shaded.logits),
-        near_surface(shaded, intervals, is_backdrop),
+        near_surface(*weighed(shaded), intervals, is_backdrop),
         shaded.rgb,
         is_backdrop,
     )
 
 
-def near_surface(shaded: Shaded, intervals: Intervals, is_backdrop: Tensor) -> Tensor:
-    """Which samples lie within `SURFACE_STEPS` steps of their ray's surface.
-
-    A ray whose median depth lies in the backdrop meets none, unless hardly any ray of them all
-    meets one. What is thin and before the sky has less than half of its ray's weight: it is guarded
-    by the image price alone.
-
-    Args:
-        is_backdrop: [M] bool.
-    Returns:
-        [M] bool.
-    """
-    weighed = shaded.weights, shaded.accumulation, shaded.packed_info
-    return near_surface_by(*weighed, intervals, is_backdrop)
+def weighed(shaded: Shaded) -> tuple[Tensor, Tensor, Tensor]:
+    """Rendering weights [M], their sums [R], and start and count of each ray [R, 2]."""
+    return shaded.weights, shaded.accumulation, shaded.packed_info
 
 
-def near_surface_by(
+def near_surface(
     weights: Tensor,
     accumulation: Tensor,
     packed_info: Tensor,
     intervals: Intervals,
     is_backdrop: Tensor,
 ) -> Tensor:
-    """`near_surface` from rendering weights [M], their sums [R], and start and count [R, 2]."""
+    """Which samples lie within `SURFACE_STEPS` steps of their ray's surface: [M] bool.
+
+    A ray whose median depth lies in the backdrop meets none, unless hardly any ray of them all
+    meets one. What is thin and before the sky has less than half of its ray's weight: it is guarded
+    by the image price alone.
+
+    Args:
+        weights, accumulation, packed_info: see `weighed`.
+        is_backdrop: [M] bool.
+    """
     if len(is_backdrop) == 0:
         return is_backdrop
     medians = _medians(weights, accumulation, packed_info, intervals)
@@ -86,13 +93,9 @@ def near_surface_by(
 
 
 def near_median_depth(shaded: Shaded, intervals: Intervals) -> Tensor:
-    """Which samples lie within `SURFACE_STEPS` steps of the depth that halves their ray's weight.
-
-    Returns:
-        [M] bool.
-    """
-    weighed = shaded.weights, shaded.accumulation, shaded.packed_info
-    return _near(_medians(*weighed, intervals), intervals)
+    """Which samples lie within `SURFACE_STEPS` steps of the depth that halves their ray's weight:
+    [M] bool."""
+    return _near(_medians(*weighed(shaded), intervals), intervals)
 
 
 def _near(medians: Tensor, intervals: Intervals) -> Tensor:
@@ -118,11 +121,13 @@ def _medians(
 
 
 class DenseRendering(NamedTuple):
-    """What `calibration.measure` and its kin take: see there."""
+    """Rays with which skipping is compared, in chunks."""
 
     references: list[Reference]
     truths: list[Tensor]
+    """True pixels, [R, 3] each."""
     render_kept: Callable[[int, Tensor], Tensor]
+    """Renders a chunk, by its number, with only the samples of a mask [M]: returns [R, 3]."""
 
 
 @contextmanager

@@ -57,8 +57,8 @@ def price(
     with evaluating(mixture):
         rendering = dense_rendering(mixture, rays, truth, config.rays_at_once)
         of_cameras = [dense_reference(mixture, of_one) for of_one, _ in cameras]
-        measured = calibrate(*rendering, config, cameras=of_cameras)
-        of_backdrop = backdrop_price(*rendering)
+        measured = calibrate(rendering, config, cameras=of_cameras)
+        of_backdrop = backdrop_price(rendering)
         rendered = torch.cat([reference.rgb for reference in rendering.references]).clamp(0.0, 1.0)
     rule, region = mixture.rule(), mixture.region
     return measured, {

@@ -65,7 +65,7 @@ class HeldOut:
         rays, truth = self.rays(config.rays, seed, "all")
         with evaluating(self.mixture):
             rendering = dense_rendering(self.mixture, rays, truth, config.rays_at_once)
-            return calibrate(*rendering, config, below=below, missed_only=True)
+            return calibrate(rendering, config, below=below, missed_only=True)
 
     def prepare(self) -> None:
         """See `price_watch.PriceSource`."""
@@ -80,7 +80,7 @@ class HeldOut:
         rays, truth = self.rays(config.recheck_rays, seed, "recheck")
         with evaluating(mixture):
             rendering = dense_rendering(mixture, rays, truth, config.rays_at_once)
-            prices = ray_prices(*rendering, float(mixture.threshold), missed_only=True)
+            prices = ray_prices(rendering, float(mixture.threshold), missed_only=True)
         return {
             "lost surface mass": prices.surface_excess(config),
             "the image price": prices.image_excess(config),

@@ -250,14 +250,14 @@ def sharpen(
         gate = teach(config.gate, lesson, config.steps, mixture.precision)
         rays, truth = held_out
         rendering = dense_rendering(mixture, rays, truth, at_once, seen_reference)
-        before = measure(*rendering, float(mixture.threshold))
+        before = measure(rendering, float(mixture.threshold))
         score = partial(mixture.occupancies, gate=gate)
         asked = asked_by(mixture, score, in_chunks(rays, at_once), rendering)
         of_each = [of_one for of_one, _ in cameras]
         of_cameras = [
             _said_by(mixture, score, one, seen_reference(mixture, one)) for one in of_each
         ]
-        measured = calibrate(*asked, calibration, cameras=of_cameras)
+        measured = calibrate(asked, calibration, cameras=of_cameras)
         promised = promise(of_cameras, measured, calibration)
     return Sharpened(gate, measured, before, promised)
 

@@ -24,10 +24,12 @@ from leco_plugin.learning.calibration import (
 )
 from leco_plugin.learning.dense import (
     SURFACE_STEPS,
+    DenseRendering,
     Reference,
     near_median_depth,
     near_surface,
     reference_of,
+    weighed,
 )
 from leco_plugin.models.rendering import Intervals, Rays, Shaded
 from leco_plugin.samplers.packed import accumulate_along_rays, pack_info
@@ -70,8 +72,8 @@ class Problem:
         chunk = self.chunks[number]
         return chunk.render(chunk.reference.weights * mask)
 
-    def arguments(self) -> tuple:
-        return self.references, self.truths, self.render_kept
+    def rendering(self) -> DenseRendering:
+        return DenseRendering(self.references, self.truths, self.render_kept)
 
 
 def test_a_backdrop_that_the_gate_calls_empty_is_neither_skipped_nor_lost() -> None:
@@ -83,7 +85,7 @@ def test_a_backdrop_that_the_gate_calls_empty_is_neither_skipped_nor_lost() -> N
         )
         for reference in problem.references
     ]
-    found = measure(*problem.arguments(), threshold=1.0)
+    found = measure(problem.rendering(), threshold=1.0)
     kept = sum(int((one.occupancies >= 1.0).sum()) for one in problem.references)
     backdrops = 2 * RAYS
     assert found.empty_fraction == pytest.approx(1.0 - (kept + backdrops) / (2 * RAYS * SAMPLES))
@@ -104,8 +106,8 @@ def test_the_threshold_is_the_largest_within_the_bounds(
     seed: int, mass: float, price: float
 ) -> None:
     problem, config = Problem(seed), CalibrationConfig(mass, price)
-    found = calibrate(*problem.arguments(), config)
-    fitting = [t for t in THRESHOLDS if measure(*problem.arguments(), t).within(config)]
+    found = calibrate(problem.rendering(), config)
+    fitting = [t for t in THRESHOLDS if measure(problem.rendering(), t).within(config)]
     assert found.threshold == max(fitting, default=0.0)
     assert found.threshold == 0.0 or found.within(config)
 
@@ -113,13 +115,13 @@ def test_the_threshold_is_the_largest_within_the_bounds(
 def test_no_photograph_that_vouches_loses_more_than_its_bound() -> None:
     problem, config = Problem(0), CalibrationConfig(0.05, 1.0)
     cameras = [Chunk(seed).reference for seed in (12, 13, 17, 25, 36, 39, 42, 43, 44)]
-    alone = calibrate(*problem.arguments(), config)
+    alone = calibrate(problem.rendering(), config)
     lower = THRESHOLDS[THRESHOLDS.index(alone.threshold) + 1]
     bound = worst_loss(cameras, lower)
     assert worst_loss(cameras, alone.threshold) > bound > config.camera_surface_mass
     config = replace(config, camera_surface_mass=bound)
-    found = calibrate(*problem.arguments(), config, cameras=cameras)
-    assert found == measure(*problem.arguments(), lower)
+    found = calibrate(problem.rendering(), config, cameras=cameras)
+    assert found == measure(problem.rendering(), lower)
     promised = promise(cameras, found, config)
     assert promised["worst_surface_mass"] == promised["bound"] == bound
     assert (promised["count"], promised["confidence"]) == (9, 0.9)
@@ -129,8 +131,8 @@ def test_a_view_that_no_threshold_does_justice_to_lowers_nothing_and_is_said() -
     problem, config = Problem(0), CalibrationConfig(0.05, 1.0, camera_surface_mass=0.01)
     strange = Chunk(10).reference
     strange = strange._replace(occupancies=torch.zeros_like(strange.occupancies))
-    alone = calibrate(*problem.arguments(), config)
-    assert calibrate(*problem.arguments(), config, cameras=[strange]) == alone
+    alone = calibrate(problem.rendering(), config)
+    assert calibrate(problem.rendering(), config, cameras=[strange]) == alone
     assert promise([strange], alone, config)["bound"] == pytest.approx(1.0)
     assert promise([], alone, config) is None
 
@@ -154,10 +156,10 @@ def test_photographs_that_vouch_may_keep_a_quarter_more_candidates(
         return Reference(intervals, there.float() / there.sum(), occupancies, there, grey, never)
 
     ray, photograph = seen_at(1.0), seen_at(0.2)
-    parts = [ray], [grey], lambda number, mask: grey
-    found = calibrate(*parts, CONFIG, cameras=[photograph])
+    rendering = DenseRendering([ray], [grey], lambda number, mask: grey)
+    found = calibrate(rendering, CONFIG, cameras=[photograph])
     assert (found.threshold <= 0.2) == followed
-    assert followed or found == calibrate(*parts, CONFIG)
+    assert followed or found == calibrate(rendering, CONFIG)
 
 
 def test_what_a_photograph_loses_never_falls_as_the_threshold_rises() -> None:
@@ -169,7 +171,7 @@ def test_nothing_is_skipped_when_no_threshold_fits() -> None:
     problem = Problem(0)
     for reference in problem.references:
         reference.occupancies.zero_()  # a gate that calls the whole scene empty
-    found = calibrate(*problem.arguments(), CalibrationConfig())
+    found = calibrate(problem.rendering(), CalibrationConfig())
     assert found == (0.0,) * len(found)
 
 
@@ -180,7 +182,7 @@ def test_a_perfect_gate_gets_the_largest_threshold_for_nothing() -> None:
         chunk.reference.weights[empty] = 0.0
         chunk.reference.rgb.copy_(chunk.render(chunk.reference.weights))
         chunk.reference.occupancies.copy_((~empty).float())
-    found = calibrate(*problem.arguments(), CalibrationConfig(0.0, 0.0))
+    found = calibrate(problem.rendering(), CalibrationConfig(0.0, 0.0))
     assert found.threshold == max(THRESHOLDS)
     assert found[1:4] == (0.0, 0.0, 0.0)
     assert 0.4 < found.empty_fraction < 0.6
@@ -201,7 +203,7 @@ def test_prices_are_those_of_their_definitions() -> None:
             [problem.render_kept(i, ~masks[i]) for i in range(2)],
         )
     ]
-    found = measure(*problem.arguments(), threshold)
+    found = measure(problem.rendering(), threshold)
     assert found.lost_mass == pytest.approx(float(weights[gone].sum() / weights.sum()), rel=1e-5)
     expected = float(weights[gone & near].sum() / weights[near].sum())
     assert found.lost_surface_mass == pytest.approx(expected, rel=1e-5)
@@ -213,8 +215,8 @@ def test_prices_are_those_of_their_definitions() -> None:
 
 def test_standard_errors_are_those_of_a_bootstrap_over_rays() -> None:
     problem, threshold = Problem(5), 0.4
-    rays = ray_prices(*problem.arguments(), threshold)
-    found = measure(*problem.arguments(), threshold)
+    rays = ray_prices(problem.rendering(), threshold)
+    found = measure(problem.rendering(), threshold)
     drawn = torch.randint(2 * RAYS, (4000, 2 * RAYS), generator=torch.Generator().manual_seed(0))
     masses = rays.lost_surface[drawn].sum(dim=1) / rays.surface[drawn].sum(dim=1)
     prices = 10.0 * torch.log10(
@@ -233,7 +235,7 @@ def test_one_ray_of_a_few_does_not_decide_and_many_do() -> None:
             reference.occupancies[lost & reference.near_surface] = 0.0
         if fits:
             scene.references[1].occupancies.fill_(1.0)
-        found = measure(*scene.arguments(), 0.5)
+        found = measure(scene.rendering(), 0.5)
         found = found._replace(image_price_db=0.0, price_error_db=0.0)
         config = CalibrationConfig(lost_surface_mass=5e-3)
         assert found.lost_surface_mass > 4 * config.lost_surface_mass
@@ -244,7 +246,7 @@ def test_one_ray_of_a_few_does_not_decide_and_many_do() -> None:
 
 def test_a_backdrop_is_worth_what_the_image_loses_without_it() -> None:
     problem = Problem(2)
-    assert backdrop_price(*problem.arguments()) == 0.0  # there is none
+    assert backdrop_price(problem.rendering()) == 0.0  # there is none
     last = torch.arange(RAYS * SAMPLES) % SAMPLES == SAMPLES - 1
     errors = torch.zeros(2)
     for number, chunk in enumerate(problem.chunks):
@@ -253,16 +255,16 @@ def test_a_backdrop_is_worth_what_the_image_loses_without_it() -> None:
         errors += torch.stack([(image - chunk.truth).square().sum() for image in images])
     expected = float(10.0 * torch.log10(errors[1] / errors[0]))
     assert expected > 0.0
-    assert backdrop_price(*problem.arguments()) == pytest.approx(expected, rel=1e-4)
-    assert backdrop_price([], [], problem.render_kept) == 0.0
+    assert backdrop_price(problem.rendering()) == pytest.approx(expected, rel=1e-4)
+    assert backdrop_price(DenseRendering([], [], problem.render_kept)) == 0.0
 
 
 def test_without_an_image_there_is_no_image_price() -> None:
-    assert math.isnan(measure(*Problem(0).arguments(), 0.1, with_image=False).image_price_db)
+    assert math.isnan(measure(Problem(0).rendering(), 0.1, with_image=False).image_price_db)
 
 
 def test_no_rays_at_all_cost_nothing() -> None:
-    found = measure([], [], lambda i, mask: mask, 0.5)
+    found = measure(DenseRendering([], [], lambda i, mask: mask), 0.5)
     assert found.lost_surface_mass == found.lost_mass == found.empty_fraction == 0.0
 
 
@@ -299,9 +301,11 @@ def test_before_a_backdrop_that_holds_the_median_there_is_no_surface() -> None:
     weights, none = torch.tensor([*hazy, *solid, *thin]), torch.zeros(0)
     packed = pack_info(ray_indices, 3)
     shaded = Shaded(none, torch.ones(3), none, weights, none, none, none, packed)
-    near = near_surface(shaded, intervals, torch.tensor([False, False, False, True]).repeat(3))
+    near = near_surface(
+        *weighed(shaded), intervals, torch.tensor([False, False, False, True]).repeat(3)
+    )
     assert near.view(3, 4).tolist() == [[False] * 4, [True] * 4, [True, True, True, False]]
-    everywhere = near_surface(shaded, intervals, torch.zeros(12, dtype=torch.bool))
+    everywhere = near_surface(*weighed(shaded), intervals, torch.zeros(12, dtype=torch.bool))
     assert torch.equal(everywhere, near_median_depth(shaded, intervals))
 
 
@@ -325,16 +329,16 @@ def test_no_samples_have_no_median() -> None:
     none, no_rays = torch.zeros(0), torch.zeros(0, dtype=torch.int64)
     shaded = Shaded(none, torch.zeros(3), none, none, none, none, none, pack_info(no_rays, 3))
     assert near_median_depth(shaded, Intervals(no_rays, none, none)).shape == (0,)
-    assert near_surface(shaded, Intervals(no_rays, none, none), none.bool()).shape == (0,)
+    assert near_surface(*weighed(shaded), Intervals(no_rays, none, none), none.bool()).shape == (0,)
 
 
 @settings(deadline=None, max_examples=30)
 @given(seed=st.integers(0, 1000), which=st.integers(0, len(THRESHOLDS) - 1))
 def test_rays_exceed_the_bounds_on_average_where_the_price_does(seed: int, which: int) -> None:
     problem, threshold = Problem(seed), THRESHOLDS[which]
-    parts = problem.references, problem.truths, problem.render_kept
-    measured = measure(*parts, threshold, missed_only=True)
-    rays = ray_prices(*parts, threshold, missed_only=True)
+    rendering = problem.rendering()
+    measured = measure(rendering, threshold, missed_only=True)
+    rays = ray_prices(rendering, threshold, missed_only=True)
     surface, image = rays.surface_excess(CONFIG), rays.image_excess(CONFIG)
     assert surface.shape == image.shape == (2 * RAYS,)
     for excess, price, bound in (
@@ -360,9 +364,9 @@ def test_what_no_photograph_misses_is_not_lost(seed: int) -> None:
             images = gated, problem.render_kept(number, mask | reference.near_surface)
             errors = [float((rgb[ray] - truth[ray]).norm()) for rgb in images]
             lost += float(weights[~mask[mine]].sum()) if errors[0] > errors[1] else 0.0
-    found = measure(*problem.arguments(), threshold, missed_only=True)
+    found = measure(problem.rendering(), threshold, missed_only=True)
     assert found.lost_surface_mass == pytest.approx(lost / surface, rel=1e-4)
-    assert found.lost_surface_mass <= measure(*problem.arguments(), threshold).lost_surface_mass
+    assert found.lost_surface_mass <= measure(problem.rendering(), threshold).lost_surface_mass
 
 
 def test_a_dense_rendering_that_is_wrong_lowers_no_threshold() -> None:
@@ -370,18 +374,18 @@ def test_a_dense_rendering_that_is_wrong_lowers_no_threshold() -> None:
     haze = [reference.occupancies < 0.3 for reference in problem.references]
     problem.truths[:] = [problem.render_kept(i, ~gone) for i, gone in enumerate(haze)]
     config = CalibrationConfig(1e-6, 99.0)
-    trusting = calibrate(*problem.arguments(), config)
-    wary = calibrate(*problem.arguments(), config, missed_only=True)
+    trusting = calibrate(problem.rendering(), config)
+    wary = calibrate(problem.rendering(), config, missed_only=True)
     assert trusting.threshold < 0.1 < 0.2 < wary.threshold < 0.3
 
 
 def test_only_lower_thresholds_are_tried_where_that_is_asked() -> None:
     problem = Problem(0)
-    parts = problem.references, problem.truths, problem.render_kept
+    rendering = problem.rendering()
     free = CalibrationConfig(lost_surface_mass=1.0, image_price_db=99.0)
-    assert calibrate(*parts, free).threshold == THRESHOLDS[0]
-    assert calibrate(*parts, free, below=THRESHOLDS[3]).threshold == THRESHOLDS[4]
-    assert calibrate(*parts, free, below=THRESHOLDS[-1]).threshold == 0.0
+    assert calibrate(rendering, free).threshold == THRESHOLDS[0]
+    assert calibrate(rendering, free, below=THRESHOLDS[3]).threshold == THRESHOLDS[4]
+    assert calibrate(rendering, free, below=THRESHOLDS[-1]).threshold == 0.0
 
 
 @pytest.mark.parametrize("number", range(len(THRESHOLDS)))

@@ -128,12 +128,12 @@ def test_the_threshold_is_lowered_to_one_within_the_bounds_or_to_none(
     asked: list[Any] = []
 
     def calibrate(
-        rays: Any, truth: Any, config: CalibrationConfig, below: float, missed_only: bool
+        rendering: Any, config: CalibrationConfig, below: float, missed_only: bool
     ) -> Measured:
         assert missed_only
         any_surface = replace(CONFIG, lost_surface_mass=1.0)
         assert config == (any_surface if anew else CONFIG)  # haze is before a young field's
-        asked.append((rays, below))
+        asked.append((rendering[0], below))
         return Measured(found, 1e-4, 2e-3, 0.01, 0.5 if found else 0.0)
 
     monkeypatch.setattr(held_out, "dense_rendering", lambda mixture, *rays: rays[:2])
