@@ -20,18 +20,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.learning.calibration import CalibrationConfig
-from leco_plugin.learning.merging import MergingConfig
 from leco_plugin.learning.run import Progress
-from leco_plugin.learning.schedule import ScheduleConfig, ramp, schedule_since
-from leco_plugin.learning.sharpening import SharpeningConfig
+from leco_plugin.learning.schedule import ramp, schedule_since
 from leco_plugin.models.mixture import Following
 from leco_plugin.models.objective import GateLossConfig
+
+if TYPE_CHECKING:
+    from leco_plugin.models.leco_config import LecoModelConfig
 
 MOST_RECOVERIES = 3
 FEWEST_STEPS = 100
@@ -257,20 +257,6 @@ def annealed(config: GateLossConfig, progress: Progress, step: int) -> GateLossC
     )
 
 
-class LearnerConfig(Protocol):
-    """What a learner reads of the settings of a method; see `LecoModelConfig`."""
-
-    schedule: ScheduleConfig
-    gate_loss: GateLossConfig
-    calibration: CalibrationConfig
-    merging: MergingConfig
-    sharpening: SharpeningConfig
-    termination: float
-    look_everywhere: float
-    likely_above: float
-    homogeneous: bool
-
-
 class StepPlan(NamedTuple):
     """How one training step samples and what it teaches."""
 
@@ -286,7 +272,7 @@ class StepPlan(NamedTuple):
 
 
 def plan_of(
-    step: int, config: LearnerConfig, progress: Progress, learning: bool, frozen: bool
+    step: int, config: LecoModelConfig, progress: Progress, learning: bool, frozen: bool
 ) -> StepPlan:
     """How a step samples and what it teaches.
 

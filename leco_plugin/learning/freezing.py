@@ -1,4 +1,4 @@
-"""Freezing: what the gate costs and saves, its report, and the files that a run writes then.
+"""Freezing: advice on what the gate saves, and the files that a run writes then.
 
 A guided field is not trained where the gate skips, so it cannot show what was lost there. The field
 that the gate was calibrated on can. It is saved, and smaller gates are measured against it.
@@ -13,22 +13,11 @@ from pickle import UnpicklingError
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from leco_plugin.evaluation.metrics import psnr
-from leco_plugin.learning.calibration import (
-    CalibrationConfig,
-    Measured,
-    backdrop_price,
-    calibrate,
-    promise,
-)
-from leco_plugin.learning.dense import dense_reference, dense_rendering, evaluating
-from leco_plugin.learning.quality import FIELD, ONE_COLOUR, psnr_of_one_colour
+from leco_plugin.learning.calibration import Measured
 from leco_plugin.log import note, say
 from leco_plugin.models.mixture import Mixture
-from leco_plugin.models.rendering import Rays
-from leco_plugin.occupancy import BACKDROP_PRICE, CAMERAS_THAT_VOUCH, Occupancy
+from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.input_error import one_line
 from leco_plugin.scenes.whole_files import write_whole
 
@@ -37,44 +26,6 @@ FIELD_FILE = "field_at_freezing.pt"
 HARDLY_ANYTHING = 0.05
 """Share of all candidates below which a run that skips no more is given advice, and a gate in the
 paper's form is taught otherwise."""
-
-
-@torch.no_grad()
-def price(
-    mixture: Mixture,
-    rays: Rays,
-    truth: Tensor,
-    cameras: list[tuple[Rays, Tensor]],
-    config: CalibrationConfig,
-) -> tuple[Measured, dict[str, Any]]:
-    """The threshold within the bounds, and what a report says of it.
-
-    Args:
-        rays: held out, cut to the mixture's region.
-        truth: [R, 3] their colours.
-        cameras: the same of each photograph that vouches.
-    """
-    with evaluating(mixture):
-        rendering = dense_rendering(mixture, rays, truth, config.rays_at_once)
-        of_cameras = [dense_reference(mixture, of_one) for of_one, _ in cameras]
-        measured = calibrate(rendering, config, cameras=of_cameras)
-        of_backdrop = backdrop_price(rendering)
-        rendered = torch.cat([reference.rgb for reference in rendering.references]).clamp(0.0, 1.0)
-    rule, region = mixture.rule(), mixture.region
-    return measured, {
-        "params": sum(p.numel() for p in mixture.gate.parameters()),
-        **measured._asdict(),
-        BACKDROP_PRICE: round(of_backdrop, 4),
-        FIELD: round(psnr(rendered, truth), 3),
-        ONE_COLOUR: round(psnr_of_one_colour(truth), 3),
-        "calibration_rays": len(truth),
-        CAMERAS_THAT_VOUCH: promise(of_cameras, measured, config),
-        "near": float(region.near),
-        "far": float(region.far),
-        "step_size": rule.step_size,
-        "cone_angle": rule.cone_angle,
-        "aabb": region.aabb.tolist(),
-    }
 
 
 def advice_on(measured: Measured, steps: int, recoveries: int) -> str | None:

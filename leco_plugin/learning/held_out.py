@@ -11,21 +11,31 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from leco_plugin.learning.calibration import CalibrationConfig, Measured, calibrate, ray_prices
-from leco_plugin.learning.dense import dense_rendering, evaluating
-from leco_plugin.learning.freezing import price
+from leco_plugin.evaluation.metrics import psnr
+from leco_plugin.learning.calibration import (
+    CalibrationConfig,
+    Measured,
+    backdrop_price,
+    calibrate,
+    promise,
+    ray_prices,
+)
+from leco_plugin.learning.dense import dense_reference, dense_rendering, evaluating
 from leco_plugin.learning.merging import Merging, find_unneeded
+from leco_plugin.learning.price_watch import PriceSource
+from leco_plugin.learning.quality import FIELD, ONE_COLOUR, psnr_of_one_colour
 from leco_plugin.learning.sharpening import Sharpened, SharpeningConfig, sharpen
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.rendering import Rays
+from leco_plugin.occupancy import BACKDROP_PRICE, CAMERAS_THAT_VOUCH
 
 if TYPE_CHECKING:
     from leco_plugin.scenes.learning_data import LearningData
     from leco_plugin.scenes.pixels.held_out_pixels import Share
 
 
-class HeldOut:
+class HeldOut(PriceSource):
     """Held-out pixels, as a mixture renders them.
 
     Args:
@@ -52,11 +62,34 @@ class HeldOut:
         """Rays of each photograph that vouches, and their colours."""
         return self.data.of_vouching(self.mixture, self.config.cameras, self.config.camera_rays)
 
+    @torch.no_grad()
     def price(self) -> tuple[Measured, dict[str, Any]]:
-        """The threshold to freeze at, and what a report says of it."""
-        rays, cameras = self.rays(self.config.rays), self.cameras()
-        measured, report = price(self.mixture, *rays, cameras, self.config)
-        return measured, report | self.data.facts()
+        """The threshold to freeze at, within the bounds, and what a report says of it."""
+        mixture, config = self.mixture, self.config
+        rays, truth = self.rays(config.rays)
+        cameras = self.cameras()
+        with evaluating(mixture):
+            rendering = dense_rendering(mixture, rays, truth, config.rays_at_once)
+            of_cameras = [dense_reference(mixture, of_one) for of_one, _ in cameras]
+            measured = calibrate(rendering, config, cameras=of_cameras)
+            of_backdrop = backdrop_price(rendering)
+            rendered = torch.cat([reference.rgb for reference in rendering.references])
+        rule, region = mixture.rule(), mixture.region
+        return measured, {
+            "params": sum(p.numel() for p in mixture.gate.parameters()),
+            **measured._asdict(),
+            BACKDROP_PRICE: round(of_backdrop, 4),
+            FIELD: round(psnr(rendered.clamp(0.0, 1.0), truth), 3),
+            ONE_COLOUR: round(psnr_of_one_colour(truth), 3),
+            "calibration_rays": len(truth),
+            CAMERAS_THAT_VOUCH: promise(of_cameras, measured, config),
+            "near": float(region.near),
+            "far": float(region.far),
+            "step_size": rule.step_size,
+            "cone_angle": rule.cone_angle,
+            "aabb": region.aabb.tolist(),
+            **self.data.facts(),
+        }
 
     @torch.no_grad()
     def lower(self, below: float, seed: int) -> Measured:
@@ -67,15 +100,9 @@ class HeldOut:
             rendering = dense_rendering(self.mixture, rays, truth, config.rays_at_once)
             return calibrate(rendering, config, below=below, missed_only=True)
 
-    def prepare(self) -> None:
-        """See `price_watch.PriceSource`."""
-
     def excesses(self, seed: int) -> dict[str, Tensor]:
-        """See `price_watch.PriceSource`.
-
-        What is lost near surfaces counts where the photographs miss it: where the gate skips, the
-        field is not trained any more, and shows haze.
-        """
+        """What is lost near surfaces counts where the photographs miss it: where the gate skips,
+        the field is not trained any more, and shows haze."""
         config, mixture = self.guided, self.mixture
         rays, truth = self.rays(config.recheck_rays, seed, "recheck")
         with evaluating(mixture):
@@ -87,7 +114,6 @@ class HeldOut:
         }
 
     def count_rays(self, limit: int) -> float:
-        """See `price_watch.PriceSource`."""
         return self.data.count_held_out(limit)
 
     def sharpened(self, losses: GateLossConfig, config: SharpeningConfig) -> Sharpened | None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from leco_plugin.evaluation.clock import seconds_now
-from leco_plugin.learning.collapse import STEPS_PER_LOOK, LearnerConfig, StepPlan, is_dense, plan_of
+from leco_plugin.learning.collapse import STEPS_PER_LOOK, StepPlan, is_dense, plan_of
 from leco_plugin.learning.freezing import advice_on, carry_over, leave_field, leave_file
 from leco_plugin.learning.held_out import HeldOut
 from leco_plugin.learning.history import GateHistory, Probes
@@ -42,6 +42,7 @@ from leco_plugin.models.gate import occupancy_from_logits
 from leco_plugin.models.mixture import Mixture
 
 if TYPE_CHECKING:
+    from leco_plugin.models.leco_config import LecoModelConfig
     from leco_plugin.scenes.learning_data import LearningData
 
 FEWEST_KEPT = 0.5
@@ -72,7 +73,7 @@ class Learner:
         mixture: Mixture,
         data: LearningData,
         run: Run,
-        config: LearnerConfig,
+        config: LecoModelConfig,
         progress: Progress,
     ) -> None:
         self.mixture, self.data, self.run = mixture, data, run

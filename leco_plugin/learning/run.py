@@ -45,8 +45,9 @@ class Run(Protocol):
         """Has optimizers forget all parameters but these, by the names of their groups."""
 
 
-class LearningOnly:
-    """A run that ends when the gate is frozen, and leaves no file."""
+class LearningOnly(Run):
+    """A run that ends when the gate is frozen, and leaves no file; over in minutes, it saves no
+    checkpoint."""
 
     goes_on, start, end = False, 0, math.inf
     folder: Path | None = None
@@ -56,14 +57,7 @@ class LearningOnly:
         self._optimizers = optimizers or []
 
     def optimizers(self) -> list[Optimizer]:
-        """Those that it was given."""
         return self._optimizers
-
-    def save(self, step: int) -> None:
-        """Nothing: it is over in minutes."""
-
-    def forget(self, groups: dict[str, list[nn.Parameter]]) -> None:
-        """Nothing: no parameter leaves before the run is over."""
 
 
 def keep_pace(optimizers: Iterable[Optimizer], pace: float) -> None:
