@@ -30,11 +30,7 @@ PROBES = 16384
 
 
 class Probes:
-    """A mixture at fixed positions along training rays.
-
-    Args:
-        seen: rays that cover the training images.
-    """
+    """A mixture at fixed positions along rays that cover the training images."""
 
     def __init__(self, mixture: Mixture, seen: Survey) -> None:
         self.mixture = mixture
@@ -60,24 +56,17 @@ class Probes:
     @torch.no_grad()
     def routes_and_densities(self) -> tuple[Tensor, Tensor]:
         """The expert of each position [P] int64, and densities there [P] per half extent."""
-        mixture = self.mixture
+        mixture, places = self.mixture, self.positions
+        left = mixture.field.experts.remaining_experts()
         with gate_precision(mixture.device.type, mixture.precision):
-            gate_values, routes = gate_values_and_routes(
-                mixture.gate(self.positions),
-                mixture.routing,
-                mixture.field.experts.remaining_experts(),
-            )
-            sigmas, _ = mixture.field.density(self.positions, routes, gate_values)
-        return routes, sigmas
+            values, routes = gate_values_and_routes(mixture.gate(places), mixture.routing, left)
+            return routes, mixture.field.density(places, routes, values)[0]
 
 
 def as_learned(occupancy: Occupancy) -> Occupancy:
     """An occupancy with a gate and threshold as they were learned, before a smaller one was taught;
-    the weights of such a gate are those of a new one: a history holds the real ones.
-
-    Raises:
-        ValueError: the report is damaged.
-    """
+    the weights of such a gate are those of a new one: a history holds the real ones. ValueError if
+    the report is damaged."""
     learned = occupancy.report.get("learned")
     if learned is None:
         return occupancy
@@ -87,8 +76,7 @@ def as_learned(occupancy: Occupancy) -> Occupancy:
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"the occupancy's report names no gate as `learned` ({error})") from None
     gate = Gate(config).requires_grad_(False)
-    said = (threshold, occupancy.precision, occupancy.report)
-    return Occupancy(gate, occupancy.space, *said, occupancy.walls, occupancy.seen).eval()
+    return occupancy.with_gate(gate, threshold, occupancy.report).eval()
 
 
 @dataclass
@@ -109,12 +97,7 @@ class GateHistory:
         return len(self.steps)
 
     def look(self, step: int, seconds: float, gate: Gate, routes: Tensor, sigmas: Tensor) -> None:
-        """Remembers the gate after a step.
-
-        Args:
-            routes: [P] int64, the expert of each probe position.
-            sigmas: [P] densities there, per half extent of the scene.
-        """
+        """Remembers the gate after a step; routes and sigmas as of `routes_and_densities`."""
         experts = 1 + gate.config.scene_experts
         shares = expert_shares(routes, experts)
         sums = torch.zeros_like(shares).index_add_(0, routes, sigmas.float())
@@ -127,30 +110,23 @@ class GateHistory:
 
     @classmethod
     def load_before(cls, checkpoint: Path, step: int, gate: Gate) -> GateHistory:
-        """The history of a run before a step; empty if it stored none of this gate.
+        """The looks of a run before the step at which it resumes; none if it stored none of this
+        gate.
 
         Args:
             checkpoint: of that run, or its folder of checkpoints.
-            step: the next one.
         """
         checkpoints = checkpoint if checkpoint.is_dir() else checkpoint.parent
         try:
-            return cls.load(checkpoints.parent / FILE_NAME, gate).until(step)
+            found = cls.load(checkpoints.parent / FILE_NAME, gate)
         except (OSError, ValueError):
             return cls()
-
-    def until(self, step: int) -> GateHistory:
-        """The looks before a step, at which a run resumes."""
-        looks = sum(look < step for look in self.steps)
-        return GateHistory(*(getattr(self, each.name)[:looks] for each in fields(self)))
+        looks = sum(look < step for look in found.steps)
+        return cls(*(getattr(found, each.name)[:looks] for each in fields(cls)))
 
     def save(self, folder: Path) -> Path:
-        """Writes `occupancy_history.safetensors` in a folder, whole or not at all.
-
-        Raises:
-            ValueError: there was no look yet.
-            OSError: the folder cannot be written to.
-        """
+        """Writes `occupancy_history.safetensors` in a folder, whole or not at all; ValueError if
+        there was no look yet."""
         if not self.steps:
             raise ValueError("a history without a single look cannot be written")
         tensors = {
@@ -162,8 +138,7 @@ class GateHistory:
         for name in self.weights[0]:
             tensors[f"gate.{name}"] = torch.stack([state[name] for state in self.weights])
         path = folder / FILE_NAME
-        content = save(tensors, metadata={"format": FORMAT})
-        write_whole(path, lambda file: file.write(content))
+        write_whole(path, lambda file: file.write(save(tensors, metadata={"format": FORMAT})))
         return path
 
     def leave(self, folder: Path) -> None:
@@ -175,14 +150,8 @@ class GateHistory:
 
     @classmethod
     def load(cls, path: Path, gate: Gate) -> GateHistory:
-        """Reads what `save` wrote.
-
-        Args:
-            gate: as it became; its weights say which shapes are expected.
-        Raises:
-            OSError: there is no such file.
-            ValueError: it is no history, or the history of a gate of another shape.
-        """
+        """Reads what `save` wrote of a gate, given as it became. OSError if there is no such file;
+        ValueError if it is no history, or that of a gate of another shape."""
         try:
             with safe_open(path, framework="pt", device="cpu") as file:
                 header = file.metadata() or {}
@@ -191,12 +160,13 @@ class GateHistory:
             raise ValueError(f"{path} is not a whole safetensors file: {error}") from None
         if header.get("format") != FORMAT:
             raise ValueError(f"{path} is not a history of leco_plugin")
-        state = gate.state_dict()
-        looks, experts = len(tensors.get("steps", ())), 1 + gate.config.scene_experts
-        expected: dict[str, tuple[int, ...]] = {name: (looks,) for name in ("steps", "seconds")}
-        expected |= {name: (looks, experts) for name in ("shares", "densities")}
-        expected |= {f"gate.{name}": (looks, *value.shape) for name, value in state.items()}
-        if {name: tuple(tensor.shape) for name, tensor in tensors.items()} != expected or not looks:
+        state, experts = gate.state_dict(), (1 + gate.config.scene_experts,)
+        expected: dict[str, tuple[int, ...]] = {"steps": (), "seconds": ()}
+        expected |= {"shares": experts, "densities": experts}
+        expected |= {f"gate.{name}": tuple(value.shape) for name, value in state.items()}
+        looks = len(tensors.get("steps", ()))
+        shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+        if not looks or shapes != {name: (looks, *each) for name, each in expected.items()}:
             raise ValueError(f"{path} is the history of another gate than that of the occupancy")
         return cls(
             tensors["steps"].tolist(),

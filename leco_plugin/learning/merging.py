@@ -64,13 +64,8 @@ class Merging(NamedTuple):
 def find_unneeded(
     mixture: Mixture, rays: Rays, truth: Tensor, bound: float, rays_at_once: int
 ) -> Merging:
-    """Tries scene experts as this module says; the mixture is left as it was.
-
-    Args:
-        rays: held-out rays, cut to the mixture's region.
-        truth: [R, 3] their pixels.
-        bound: largest image price, dB.
-    """
+    """Tries scene experts as this module says, for an image price of at most `bound` dB on held-out
+    rays, cut to the mixture's region, of pixels [R, 3]; the mixture is left as it was."""
     with evaluating(mixture):
         kept = [
             (some, mixture.with_backdrops(some, mixture.kept(some)))
@@ -89,13 +84,12 @@ def find_unneeded(
                 expert = int(held.argmin()) + 1
                 share = float(shares[expert])
                 out.append((expert, experts.drop(expert)))
-                shares_without, error = _surface_and_error(mixture, kept, truths)
-                price = price_db(float(error), float(before), EXACT)
-                if price <= bound:
-                    dropped.append(Trial(expert, share, price))
-                    shares = shares_without
+                shares, error = _surface_and_error(mixture, kept, truths)
+                trial = Trial(expert, share, price_db(float(error), float(before), EXACT))
+                if trial.price_db <= bound:
+                    dropped.append(trial)
                 else:
-                    refused = Trial(expert, share, price)
+                    refused = trial
         finally:
             for expert, module in out:
                 experts.put_back(expert, module)

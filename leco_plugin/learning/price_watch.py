@@ -36,12 +36,8 @@ class Evidence(NamedTuple):
     squares: float = 0.0
 
     def with_rays(self, values: Tensor, most: float) -> Evidence:
-        """With the rays of one more measurement.
-
-        Args:
-            values: [R] excesses over a bound. Those that are not finite are no evidence.
-            most: rays that there are: however often they are measured, they are no more evidence.
-        """
+        """With the excesses [R] over a bound of one more measurement; those that are not finite are
+        no evidence. `most` rays there are: measured again and again they are no more evidence."""
         values = values[values.isfinite()].double()
         new = (float(len(values)), float(values.sum()), float(values.square().sum()))
         sums = [REMEMBERED * old + more for old, more in zip(self, new)]
@@ -75,19 +71,12 @@ class Finding(NamedTuple):
     """What a watch has found after a step."""
 
     kind: Literal["nothing kept", "beyond", "within"]
-    why: str
+    why: str = ""
     """The prices that are beyond their bounds, in words."""
 
 
 class PriceWatch:
-    """Stands beside guided training.
-
-    Args:
-        state: what is known so far; changed in place.
-        source: renders what is guided.
-        config: when to measure.
-        device: of the process.
-    """
+    """Stands beside guided training, on the device of the process; changes its state in place."""
 
     def __init__(
         self,
@@ -109,17 +98,12 @@ class PriceWatch:
         """
         self.steps, self.seconds = self.steps + 1, self.seconds + seconds
         if self._keeps_nothing(step, kept) and skips:
-            return Finding("nothing kept", "")
+            return Finding("nothing kept")
         if self.config.recheck_rays == 0:
             return None
-        if self.state.due == 0:
+        if self.state.due == 0 or (step >= self.state.due and not skips):
             self.put_off(step)
-        if step < self.state.due:
-            return None
-        if not skips:
-            self.put_off(step)
-            return None
-        return self._measure(step)
+        return self._measure(step) if step >= self.state.due else None
 
     def put_off(self, step: int) -> None:
         """The next measurement is made after the fewest steps."""
@@ -158,11 +142,6 @@ class PriceWatch:
 
 
 def steps_until_next(config: CalibrationConfig, seconds: float, a_step: float) -> int:
-    """Steps between two measurements.
-
-    Args:
-        seconds: that the last one took.
-        a_step: seconds of a training step.
-    """
+    """Steps between two measurements, by the seconds of the last one and of a training step."""
     within_share = math.ceil(seconds / (SHARE_OF_TIME * max(a_step, 1e-9)))
     return max(config.steps_per_recheck, within_share)

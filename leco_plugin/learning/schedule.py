@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from leco_plugin.learning.run import Progress
-from leco_plugin.scenes.input_error import InputError, require
+from leco_plugin.scenes.input_error import require
 
 KEPT_ABOVE = 0.1
 """o(x) from which a sample counts as kept before there is a calibrated threshold."""
@@ -48,10 +48,9 @@ class ScheduleConfig:
     gate is frozen, after `earliest`."""
 
     def __post_init__(self) -> None:
-        for name in ("learn_steps", "steps_per_check"):
-            if getattr(self, name) < 1:
-                option = f"schedule.{name.replace('_', '-')}"
-                raise InputError(f"{option} is {getattr(self, name)}; it takes at least one step")
+        require(self.learn_steps >= 1, "schedule.learn-steps", self.learn_steps, "at least 1")
+        often = self.steps_per_check
+        require(often >= 1, "schedule.steps-per-check", often, "at least 1")
         for name in ("settled", "earliest", "ramp_from", "ramp_to", "agreement"):
             share = getattr(self, name)
             require(0.0 <= share <= 1.0, f"schedule.{name.replace('_', '-')}", share, "from 0 to 1")
@@ -60,13 +59,11 @@ class ScheduleConfig:
 
 
 def ramp(step: int, config: ScheduleConfig) -> float:
-    """How far the distortion loss has come in: 0 at first, 1 from `ramp_to` on.
+    """How far the distortion loss has come in at a step since `Progress.began`: 0 at first, 1 from
+    `ramp_to` on.
 
     At once it would press all weight onto the ends of the rays, which is a flat picture behind the
     scene; first the views have to find the surfaces between them.
-
-    Args:
-        step: steps since `Progress.began`.
     """
     start, end = (share * config.learn_steps for share in (config.ramp_from, config.ramp_to))
     return min(1.0, max(0.0, (step - start) / max(1.0, end - start)))
@@ -79,9 +76,8 @@ def converged(step: int, agreement: float, config: ScheduleConfig) -> bool:
         step: steps since `Progress.began`.
         agreement: share of probe decisions equal to those of the check before; 0 at the first.
     """
-    if step + 1 >= config.learn_steps:
-        return True
-    return step + 1 >= config.earliest * config.learn_steps and agreement >= config.agreement
+    early = step + 1 < config.earliest * config.learn_steps
+    return step + 1 >= config.learn_steps or (not early and agreement >= config.agreement)
 
 
 def steps_of_an_extension(learn_steps: int) -> int:
@@ -95,13 +91,8 @@ def schedule_since(schedule: ScheduleConfig, progress: Progress) -> ScheduleConf
 
 
 def is_unsettled(step: int, agreement: float, config: ScheduleConfig, extensions: int) -> bool:
-    """Whether a gate at its step limit should learn on.
-
-    Args:
-        step: steps since `Progress.began`.
-        agreement: share of probe decisions equal to those of the check before.
-        extensions: how often it has learned on already.
-    """
+    """Whether a gate at its step limit should learn on; step and agreement as for `converged`.
+    `extensions` says how often it has done so already."""
     looked_often = step + 1 >= 4 * config.steps_per_check
     return looked_often and agreement < config.settled and extensions < MOST_EXTENSIONS
 
