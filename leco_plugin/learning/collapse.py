@@ -71,7 +71,7 @@ def find_collapse(kept_fraction: float, shares: Tensor, has_learned: bool) -> Co
 
     Args:
         kept_fraction: share of the probe positions whose o(x) is at least 0.1.
-        shares: [1 + n] share of points at each expert.
+        shares: [1 + n] share of them at each expert.
         has_learned: whether the gate has called something empty before, or the first phase is
             over. Until then one that keeps everything has only not learned enough yet.
     """
@@ -86,13 +86,8 @@ def find_collapse(kept_fraction: float, shares: Tensor, has_learned: bool) -> Co
 
 
 def look(progress: Progress, step: int, kept: float, shares: Tensor, last: bool) -> Collapse | None:
-    """The collapse of a gate, if it has lasted; `progress` notes since when one is suspected.
-
-    Args:
-        kept: share of probe positions whose o(x) is at least 0.1.
-        shares: [1 + n] share of them at each expert.
-        last: whether this look ends the first phase.
-    """
+    """The collapse of a gate, if it has lasted, or if this look is the last of the first phase;
+    `progress` notes since when one is suspected. Kept and shares are as for `find_collapse`."""
     progress.fewest_kept = min(progress.fewest_kept, kept)
     if step + 1 - progress.began < FEWEST_STEPS:
         return None
@@ -111,12 +106,9 @@ def action_on(
 ) -> Literal["heal", "leave", "leave for good", "give up"]:
     """What the rule says of a collapse that has lasted.
 
-    A gate is left as it is where the run has no steps to heal it in, and at the end of a phase
-    where the points of one expert have been shared out before: that gate knows what is empty.
-
-    Args:
-        last: whether this look ends the first phase.
-        room: steps that the run has left.
+    A gate is left as it is where the run has no room, in steps, to heal it in, and at the last look
+    of a phase where the points of one expert have been shared out before: that gate knows what is
+    empty.
     """
     if collapse.kind == "one expert":
         if last and (room < 1 or progress.balance > 1.0):
@@ -138,13 +130,8 @@ def heal(
     config: GateLossConfig,
     room: float = math.inf,
 ) -> str:
-    """Heals the gate whose last layer this is; returns what was done, in words.
-
-    Args:
-        shares: [1 + n] share of points at each expert.
-        config: what the gate is taught by.
-        room: steps that the run has left.
-    """
+    """Heals the gate whose last layer this is, as far as the run has room; returns what was done,
+    in words. Shares are as for `find_collapse`."""
     anew = is_restart_due(collapse, config, progress)
     progress.recoveries += 1
     progress.suspected_since = -1
@@ -190,14 +177,10 @@ def reset_gate_head(head: nn.Linear) -> None:
 
 @torch.no_grad()
 def spread_scene_experts(head: nn.Linear, dominant: int) -> None:
-    """Shares the points of one scene expert out among all.
+    """Shares the points of the scene expert that takes all, in [1, n], out among all.
 
     n equal logits have the log-sum-exp of one that is log n higher, so that o(x) stays as it was
     where that expert was far ahead, and falls by the share of the others where it was not.
-
-    Args:
-        head: last layer of the gate, [1 + n, width].
-        dominant: the expert that takes all points, in [1, n].
     """
     num_scene = head.out_features - 1
     head.weight[1:] = head.weight[dominant] + 0.05 * torch.randn_like(head.weight[1:])
@@ -210,12 +193,9 @@ def is_enough(room: float) -> bool:
 
 
 def is_restart_due(collapse: Collapse, config: GateLossConfig, progress: Progress) -> bool:
-    """Whether gate and field restart, at lower learning rates.
-
-    So it is where a new last layer has collapsed as well. In logit form the forces on a gate are
-    bounded; what is left as a cause is steps that overshoot, and hidden layers, of gate and field,
-    that they have ruined.
-    """
+    """Whether gate and field restart, at lower learning rates, because a new last layer has
+    collapsed as well. In logit form the forces on a gate are bounded; what is left as a cause is
+    steps that overshoot, and hidden layers, of gate and field, that they have ruined."""
     again = collapse.kind != "one expert" and progress.healed_at >= 0
     return again and form_of(config, progress) == "logit"
 
@@ -274,12 +254,8 @@ class StepPlan(NamedTuple):
 def plan_of(
     step: int, config: LecoModelConfig, progress: Progress, learning: bool, frozen: bool
 ) -> StepPlan:
-    """How a step samples and what it teaches.
-
-    Args:
-        learning: whether the occupancy is still learned.
-        frozen: whether the gate is frozen.
-    """
+    """How a step samples and what it teaches, while the occupancy is still learned or the gate is
+    frozen."""
     ramped = ramp(step - progress.began, schedule_since(config.schedule, progress))
     coarse = learning or ramped < 1.0
     # a homogeneous gate is taught nothing about emptiness

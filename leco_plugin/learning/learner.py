@@ -42,6 +42,8 @@ from leco_plugin.models.gate import occupancy_from_logits
 from leco_plugin.models.mixture import Mixture
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from leco_plugin.models.leco_config import LecoModelConfig
     from leco_plugin.scenes.learning_data import LearningData
 
@@ -82,21 +84,25 @@ class Learner:
         restarted = config.schedule.restart
         self.held_out = HeldOut(mixture, data, config.calibration, restarted)
         self.watch = PriceWatch(progress.watch, self.held_out, config.calibration, mixture.device)
-        self.recoveries = Recoveries(mixture, run, progress, config.gate_loss, config.homogeneous)
+        self.recoveries = Recoveries(mixture, run, progress, config)
 
     def begin(self) -> None:
         """Before the first step of this process: learning time, bounds, and files of the run that
         is gone on with."""
         mixture, progress, run = self.mixture, self.progress, self.run
+        configured = most = self.config.schedule.learn_steps
         # a short run still passes through both phases, and a resumed one has steps behind it
         if math.isfinite(run.end):
             steps = int(run.end) - run.start
             most = max(2, int(0.5 * steps)) + max(0, run.start - progress.since)
-            self._say_if_short(most, steps)
-        else:
-            most = self.config.schedule.learn_steps
+            if most < configured != progress.configured:  # a resumed run has said so before
+                say(
+                    f"a run of {steps} steps learns the occupancy in its first half: until step "
+                    f"{progress.since + most}, not for the {configured} steps of "
+                    "schedule.learn-steps"
+                )
         if not bool(mixture.frozen):  # else other steps would take it back into the first phase
-            progress.begin(self.config.schedule.learn_steps, most)
+            progress.begin(configured, most)
         mixture.routing = self.recoveries.routing()
         if not bool(mixture.region.known):
             found = self.data.survey
@@ -106,23 +112,10 @@ class Learner:
             say_all(self.data.doubts())
             self.data.say_what_is_fixed()
         if run.resumed_from is not None and run.folder is not None:
-            self._take_along()
+            self._take_along(run.resumed_from, run.folder)
 
-    def _say_if_short(self, most: int, steps: int) -> None:
-        """Says so before a run of few steps that learns for fewer than are configured."""
-        configured = self.config.schedule.learn_steps
-        known = configured == self.progress.configured  # a resumed run has said so before
-        if most < configured and not known:
-            say(
-                f"a run of {steps} steps learns the occupancy in "
-                f"its first half: until step {self.progress.since + most}, not for the "
-                f"{configured} steps of schedule.learn-steps"
-            )
-
-    def _take_along(self) -> None:
+    def _take_along(self, resumed: Path, folder: Path) -> None:
         """What a resumed run leaves in its folder, which may be another one than before."""
-        folder, resumed = self.run.folder, self.run.resumed_from
-        assert folder is not None and resumed is not None
         self.history = GateHistory.load_before(resumed, self.run.start, self.mixture.gate)
         if len(self.history):
             self.history.leave(folder)
@@ -136,11 +129,8 @@ class Learner:
         return Probes(self.mixture, self.data.survey)
 
     def before_step(self, step: int) -> StepPlan:
-        """Prepares the batch, and says how the step samples and what it teaches.
-
-        Both follow from the step's number, the progress and whether the gate is frozen, which
-        checkpoints hold: a resumed run is where it was.
-        """
+        """Prepares the batch, and says how the step samples and what it teaches. Both follow from
+        what checkpoints hold: a resumed run is where it was."""
         config, progress, frozen = self.config, self.progress, bool(self.mixture.frozen)
         never_frozen = config.homogeneous or not config.schedule.freeze
         self.over = never_frozen and step >= progress.learn_steps
@@ -175,13 +165,11 @@ class Learner:
 
     def after_step(self, step: int, seconds: float, kept: float) -> None:
         """Looks at the gate now and then, and freezes it when its decisions have settled; then at
-        what skipping costs.
+        what skipping costs. GateCollapsed if it has collapsed more often than it may be healed.
 
         Args:
             seconds: that the step took.
             kept: samples a ray that the frozen gate kept of the batch, backdrops excluded.
-        Raises:
-            GateCollapsed: the gate has collapsed more often than it may be healed.
         """
         if self.over or self.config.homogeneous:
             return
@@ -216,12 +204,8 @@ class Learner:
             self._freeze(step)
 
     def _has_settled(self, step: int, kept: Tensor, last: bool) -> bool:
-        """Whether to freeze at a check; a gate that has not settled is given more steps.
-
-        Args:
-            kept: [P] bool, decisions at the probe positions.
-            last: whether this check ends the first phase.
-        """
+        """Whether to freeze at a check, which is the last of the first phase or not; a gate that
+        has not settled is given more steps. `kept` [P] is what it decides at the probes."""
         schedule, progress = self.config.schedule, self.progress
         agreement = decisions_agree(progress.decisions.to(kept.device), kept)
         progress.decisions = kept
@@ -229,7 +213,7 @@ class Learner:
             return False
         if not last and float(kept.float().mean()) > NEARLY_ALL:
             return False  # it agrees with itself only because it has found nothing empty yet
-        age, of_those = step - progress.began, schedule_since(self.config.schedule, progress)
+        age, of_those = step - progress.began, schedule_since(schedule, progress)
         unsettled = last and is_unsettled(age, agreement, of_those, progress.extensions)
         if unsettled and self._extends(step, agreement):
             return False
@@ -248,11 +232,10 @@ class Learner:
         until = int(min(until, self.run.end))
         if until <= step + 1:
             return False
-        progress.extensions += 1
-        progress.learn_steps = until
+        progress.extensions, progress.learn_steps = progress.extensions + 1, until
         say(
             f"step {step}: only {agreement:.1%} of the gate's decisions are those of the last "
-            f"check; it learns on until step {progress.learn_steps}"
+            f"check; it learns on until step {until}"
         )
         return True
 
@@ -272,8 +255,7 @@ class Learner:
             f"occupancy learned in {progress.learn_seconds:.0f} s: threshold "
             f"{measured.threshold:.4f} {measured.line} ({measured.lost_mass:.2e} of all)"
         )
-        advice = advice_on(measured, step + 1 - progress.since, progress.recoveries)
-        if advice is not None:
+        if advice := advice_on(measured, step + 1 - progress.since, progress.recoveries):
             say(advice)
         if self.recoveries.fall_back(step, measured):
             return
@@ -281,7 +263,9 @@ class Learner:
         leave_field(mixture, self.run.folder)
         if not schedule.restart and self.run.goes_on:
             self._merge()
-        self._say_doubts()
+        say(views_in_words(report))
+        doubts = doubts_of_field(report.get(FIELD, math.inf), report.get(ONE_COLOUR, math.inf))
+        say_all(doubts or doubts_of_occupancy(kept_of_seen(mixture)))
         self.data.prepare_batch(1.0, distances=False)  # from now on all photographs train
         progress.watch = self.watch.state = WatchState()
         progress.suspected_since = -1  # of the gate as it is now
@@ -291,13 +275,6 @@ class Learner:
             self.recoveries.restart_field()
             say("the field starts anew, guided from its first step")
         self.run.save(step)  # a run killed from now on stays frozen
-
-    def _say_doubts(self) -> None:
-        """Says what new views may lose, and what is wrong with what is of no use."""
-        report = self.mixture.report
-        say(views_in_words(report))
-        found = doubts_of_field(report.get(FIELD, math.inf), report.get(ONE_COLOUR, math.inf))
-        say_all(found or doubts_of_occupancy(kept_of_seen(self.mixture)))
 
     def _is_time_to_sharpen(self, step: int) -> bool:
         """Whether so much of the run is over, and the field was guided for long enough by then,
@@ -311,15 +288,12 @@ class Learner:
 
     def _sharpen(self, step: int) -> None:
         """Has a small gate skip in place of the learned one where it skips more, and says so."""
-        mixture, config, started = self.mixture, self.config, seconds_now()
+        mixture, config, started = self.mixture, self.config.sharpening, seconds_now()
         self.progress.sharpened_at = step
-        kind = config.sharpening.gate.encoding.kind
-        if mixture.gate.config.encoding.kind != kind:
+        if mixture.gate.config.encoding.kind != config.gate.encoding.kind:
             return  # samplers are made for the kind that was asked for
-        found = from_first(
-            lambda: self.held_out.sharpened(config.gate_loss, config.sharpening),
-            mixture.device,
-        )
+        losses = self.config.gate_loss
+        found = from_first(lambda: self.held_out.sharpened(losses, config), mixture.device)
         if found is None:
             return
         seconds = seconds_now() - started

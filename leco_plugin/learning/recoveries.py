@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor
 
@@ -26,30 +28,22 @@ from leco_plugin.models.compute.ranks import share
 from leco_plugin.models.gate import route
 from leco_plugin.models.losses import expert_shares
 from leco_plugin.models.mixture import Mixture
-from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.rendering import Routing
+
+if TYPE_CHECKING:
+    from leco_plugin.models.leco_config import LecoModelConfig
 
 KEEPS_NOTHING = "the frozen gate keeps nothing of what the cameras see"
 
 
 class Recoveries:
-    """Heals the gate of a mixture.
-
-    Args:
-        losses: what the gate is taught by.
-        homogeneous: whether there is no empty-space expert.
-    """
+    """Heals the gate of a mixture that a method of a config learns."""
 
     def __init__(
-        self,
-        mixture: Mixture,
-        run: Run,
-        progress: Progress,
-        losses: GateLossConfig,
-        homogeneous: bool,
+        self, mixture: Mixture, run: Run, progress: Progress, config: LecoModelConfig
     ) -> None:
         self.mixture, self.run, self.progress = mixture, run, progress
-        self.losses, self.homogeneous = losses, homogeneous
+        self.losses, self.homogeneous = config.gate_loss, config.homogeneous
 
     def routing(self) -> Routing:
         """Which expert each point is sent to, after the recoveries so far."""
@@ -57,14 +51,13 @@ class Recoveries:
         return Routing(self.losses.empty_below if logit else None, self.homogeneous)
 
     def heal_if_collapsed(self, step: int, logits: Tensor, kept: Tensor, last: bool) -> bool:
-        """Heals a gate that has stayed collapsed; returns whether it did so.
+        """Heals a gate that has stayed collapsed; returns whether it did so. GateCollapsed if it
+        was healed as often as it may be.
 
         Args:
             logits: [P, 1 + n] of the gate at the probe positions.
             kept: [P] bool, whether o(x) there is worth a sample.
             last: whether this look ends the first phase.
-        Raises:
-            GateCollapsed: it was healed as often as it may be.
         """
         progress = self.progress
         routes = route(logits, self.mixture.routing.empty_below)
@@ -85,11 +78,8 @@ class Recoveries:
         return action == "heal"
 
     def fall_back(self, step: int, measured: Measured) -> bool:
-        """Restarts a useless gate in logit form; returns whether it did so.
-
-        A gate is useless if hardly anything can be skipped by it. Does nothing if the gate was
-        already taught in logit form, or if too few steps are left.
-        """
+        """Restarts a gate by which hardly anything can be skipped in logit form, unless it was
+        taught so already, or too few steps are left; returns whether it did so."""
         if not may_fall_back(self.losses) or self.progress.paper_given_up:
             return False
         if measured.empty_fraction >= HARDLY_ANYTHING or not is_enough(self._room(step)):
@@ -101,11 +91,7 @@ class Recoveries:
 
     def reopen_useless(self, step: int) -> bool:
         """Opens a frozen gate that keeps nothing, if there are steps left to learn in; returns
-        whether it did so.
-
-        Raises:
-            GateCollapsed: it was healed as often as it may be.
-        """
+        whether it did so. GateCollapsed if it was healed as often as it may be."""
         enough = is_enough(self._room(step))
         if enough and self.progress.recoveries >= MOST_RECOVERIES:
             after = f"after {MOST_RECOVERIES} recoveries"
