@@ -112,12 +112,8 @@ class Measured(NamedTuple):
 
 
 def worst_loss(cameras: Sequence[Reference], threshold: float) -> float:
-    """The largest share of its weight near surfaces that any of some photographs loses by skipping
-    below `threshold`; 0 of none. It never falls as the threshold rises.
-
-    Args:
-        cameras: a dense rendering of rays of each.
-    """
+    """The largest share of its weight near surfaces that any of some photographs, densely rendered,
+    loses by skipping below `threshold`; 0 of none. It never falls as the threshold rises."""
     losses = [0.0]
     for reference in cameras:
         surface = reference.surface_weights
@@ -248,12 +244,8 @@ def backdrop_price(rendering: DenseRendering) -> float:
 
 
 def image_price(gated: Tensor, dense: Tensor, floor: float) -> tuple[float, float]:
-    """By how many dB of PSNR an image is worse than the dense one, and the standard error of that.
-
-    Args:
-        gated, dense: [R] squared errors of the same rays.
-        floor: sum of them that is as good as none.
-    """
+    """By how many dB of PSNR an image is worse than the dense one, and the standard error of that,
+    from squared errors [R] of the same rays; a sum of `floor` is as good as none."""
     gated, dense = gated.double(), dense.double()
     after, before = float(gated.sum()), float(dense.sum())
     apart = gated / (after + floor) - dense / (before + floor)
@@ -262,11 +254,8 @@ def image_price(gated: Tensor, dense: Tensor, floor: float) -> tuple[float, floa
 
 
 def price_db(error: float, of_dense: float, floor: float) -> float:
-    """By how many dB of PSNR a squared error is worse than that of the dense image.
-
-    Args:
-        floor: squared error that is as good as none.
-    """
+    """By how many dB of PSNR a squared error is worse than that of the dense image; one of `floor`
+    is as good as none."""
     return 10.0 * math.log10((error + floor) / (of_dense + floor))
 
 

@@ -159,13 +159,8 @@ def dense_rendering(
     rays_at_once: int,
     refer: Callable[[Mixture, Rays], Reference] = dense_reference,
 ) -> DenseRendering:
-    """All candidates of given rays rendered, in chunks.
-
-    Args:
-        rays: cut to the mixture's region.
-        truth: [R, 3] their true colours.
-        refer: makes the reference of a chunk.
-    """
+    """All candidates of rays, cut to the mixture's region, rendered in chunks, with their true
+    colours [R, 3]; `refer` makes the reference of a chunk."""
     chunks = in_chunks(rays, rays_at_once)
     references = [refer(mixture, chunk) for chunk in chunks]
 

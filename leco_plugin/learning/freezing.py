@@ -29,12 +29,8 @@ paper's form is taught otherwise."""
 
 
 def advice_on(measured: Measured, steps: int, recoveries: int) -> str | None:
-    """What to do about an occupancy that skips next to nothing; None for one that skips.
-
-    Args:
-        steps: that it was learned for, from its beginning or its last recovery.
-        recoveries: how often its gate was healed.
-    """
+    """What to do about an occupancy that skips next to nothing after so many steps from its
+    beginning or its last recovery; None for one that skips."""
     if measured.threshold == 0.0:
         said = "no threshold keeps the price within its bounds, so nothing is skipped;"
     elif measured.empty_fraction >= HARDLY_ANYTHING:
@@ -95,12 +91,8 @@ def leave_field(mixture: Mixture, folder: Path | None) -> None:
 
 
 def carry_over(resumed_from: Path, folder: Path) -> None:
-    """Copies the state into the folder of a run that resumes another one, if that has left any.
-
-    Args:
-        resumed_from: a checkpoint of the other run, or its folder of checkpoints.
-        folder: of the run that goes on.
-    """
+    """Copies the state into the folder of a run that resumes another one, given by a checkpoint or
+    its folder of checkpoints, if that has left any."""
     checkpoints = resumed_from if resumed_from.is_dir() else resumed_from.parent
     left = checkpoints.parent / FIELD_FILE
     if not left.is_file() or (folder / FIELD_FILE).exists():
@@ -113,14 +105,9 @@ def carry_over(resumed_from: Path, folder: Path) -> None:
 
 
 def field_at_freezing(mixture: Mixture, folder: Path) -> Mixture | None:
-    """The mixture as it was when its gate was frozen, as another one; None where none was left.
-
-    Args:
-        mixture: of the run as it is now; it stays as it is.
-        folder: of that run.
-    Raises:
-        ValueError: the file is damaged, or of another gate than the mixture's. One line.
-    """
+    """The mixture of a run as it was when its gate was frozen, as another one; None where none was
+    left in the run's folder. ValueError, in one line, if the file is damaged, or of another gate
+    than the mixture's."""
     path = folder / FIELD_FILE
     if not path.is_file():
         return None

@@ -39,8 +39,6 @@ class HeldOut(PriceSource):
     """Held-out pixels, as a mixture renders them.
 
     Args:
-        mixture: what is rendered.
-        data: where the pixels come from.
         config: how many, and what skipping may cost.
         restarted: whether the field was begun anew when the gate was frozen. It has put surfaces
             before the haze of its first weights where the gate skips: none of its surfaces is

@@ -59,14 +59,10 @@ def views_in_words(report: dict[str, Any]) -> str:
 
 
 def doubts_of_field(field: float, one_colour: float) -> list[str]:
-    """Two lines on a field that shows hardly more than one colour; none on a good one.
-
-    Args:
-        field, one_colour: PSNR on the same held-out pixels, dB.
-    """
-    if not (math.isfinite(field) and math.isfinite(one_colour)):
-        return []
-    if field >= one_colour + LEAST_GAIN_DB:
+    """Two lines on a field that shows hardly more than one colour, by PSNR of both on the same
+    held-out pixels, dB; none on a good one, or where PSNR is not finite."""
+    known = math.isfinite(field) and math.isfinite(one_colour)
+    if not known or field >= one_colour + LEAST_GAIN_DB:
         return []
     return [
         f"this scene was not learned: {field:.1f} dB on unseen pixels, where one colour "
@@ -77,11 +73,8 @@ def doubts_of_field(field: float, one_colour: float) -> list[str]:
 
 
 def doubts_of_occupancy(kept: float) -> list[str]:
-    """Two lines on an occupancy that keeps nearly everything; none on one of use.
-
-    Args:
-        kept: share of what photographs show.
-    """
+    """Two lines on an occupancy that keeps so large a share of what photographs show; none on one
+    of use."""
     if kept <= MOST_KEPT:
         return []
     return [

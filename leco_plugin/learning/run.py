@@ -61,14 +61,9 @@ class LearningOnly(Run):
 
 
 def keep_pace(optimizers: Iterable[Optimizer], pace: float) -> None:
-    """Has optimizers step at a multiple of their learning rates from now on.
-
-    The rates are multiplied for the time of a step only: schedulers and checkpoints see what was
-    asked for.
-
-    Args:
-        pace: the multiple; a power of two leaves rates as they were to the last bit.
-    """
+    """Has optimizers step at a multiple of their learning rates from now on; a power of two leaves
+    rates as they were to the last bit. They are multiplied for the time of a step only: schedulers
+    and checkpoints see what was asked for."""
     for optimizer in optimizers:
         if not hasattr(optimizer, PACE):
             if pace == 1.0:
@@ -171,12 +166,8 @@ class Progress:
         self.learning_kept = 0.9 * self.learning_kept + 0.1 * share
 
     def begin(self, configured: int, most: int) -> None:
-        """Sets `learn_steps`, unless a checkpoint did so under the same config.
-
-        Args:
-            configured: of the config; a resumed run may have been given another one.
-            most: steps from `since` on that this process leaves for the first phase.
-        """
+        """Sets `learn_steps`, unless a checkpoint did so under the same config: those configured,
+        or as many as this process leaves for the first phase at most, from `since` on."""
         if configured != self.configured:
             self.phase = min(configured, most)
             self.learn_steps = self.since + self.phase

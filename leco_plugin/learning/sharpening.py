@@ -62,14 +62,8 @@ class Lesson(NamedTuple):
 
 
 def lesson_of(mapped: Tensor, weights: Tensor, of_rays: Tensor, losses: GateLossConfig) -> Lesson:
-    """The targets of the contribution loss at samples along rays.
-
-    Args:
-        mapped: [M, 3] in [-1, 1], in the order of rays, then distance.
-        weights: [M] rendering weights.
-        of_rays: [M] int64, the ray of each.
-        losses: w_0 and k of the loss.
-    """
+    """The targets of the contribution loss, by its w_0 and k, at samples along rays: positions
+    [M, 3] in [-1, 1], in the order of rays, then distance; rendering weights [M]; and rays [M]."""
     wide = widen(weights, of_rays[1:] == of_rays[:-1])
     target = (wide / losses.weight_at_full).clamp(max=1.0)
     return Lesson(mapped, losses.emphasis * target, 1.0 - target)
@@ -98,8 +92,7 @@ def teach(
     tables = list(gate.encoding.parameters())
     known = {id(table) for table in tables}
     groups = [{"params": [p for p in gate.parameters() if id(p) not in known], "lr": rate}]
-    if tables:
-        groups.append({"params": tables, "lr": max(rate, RATES["encoding"])})
+    groups += [{"params": tables, "lr": max(rate, RATES["encoding"])}] if tables else []
     optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer,
@@ -163,11 +156,9 @@ class SharpeningConfig:
 
 def added_costs(found: dict[str, Any], before: dict[str, Any]) -> dict[str, float]:
     """What skipping costs on top of what earlier skipping has cost, and standard errors."""
-    costs = {
-        name: max(0.0, found[name]) + max(0.0, float(before.get(name, 0.0))) for name in LOSSES
-    }
-    errors = {name: math.hypot(found[name], float(before.get(name, 0.0))) for name in ERRORS}
-    return costs | errors
+    known = {name: float(before.get(name, 0.0)) for name in (*LOSSES, *ERRORS)}
+    costs = {name: max(0.0, found[name]) + max(0.0, known[name]) for name in LOSSES}
+    return costs | {name: math.hypot(found[name], known[name]) for name in ERRORS}
 
 
 class Sharpened(NamedTuple):
@@ -204,20 +195,15 @@ class Sharpened(NamedTuple):
                 has been trained without what it skips.
             learned: the gate that routes. It stays in the report, with what it did, as `learned`.
         """
-        found = self.measured._asdict()
-        found |= added_costs(found, before)
+        measured = self.measured._asdict()
+        found = measured | added_costs(measured, before)
         if self.promised is not None:
-            found[CAMERAS_THAT_VOUCH] = dict(self.promised)
-            if (earlier := before.get(CAMERAS_THAT_VOUCH)) is not None:
-                for name in ("worst_surface_mass", "bound"):
-                    found[CAMERAS_THAT_VOUCH][name] += earlier["worst_surface_mass"]
+            earlier = (before.get(CAMERAS_THAT_VOUCH) or {}).get("worst_surface_mass", 0.0)
+            more = {name: self.promised[name] + earlier for name in ("worst_surface_mass", "bound")}
+            found[CAMERAS_THAT_VOUCH] = self.promised | more
         kept = {name: before[name] for name in ("threshold", "params", "empty_fraction", *LOSSES)}
-        return {
-            "learned": {"gate": learned.to_dict(), **kept},
-            **before,
-            **found,
-            "params": self.params,
-        }
+        known = {"learned": {"gate": learned.to_dict(), **kept}}
+        return known | before | found | {"params": self.params}
 
 
 def sharpen(
@@ -240,7 +226,6 @@ def sharpen(
         held_out: rays that nothing was trained on, and their colours [R, 3].
         cameras: the same of each photograph that vouches.
         losses: whose contribution loss teaches.
-        calibration: what skipping may cost.
     """
     at_once = calibration.rays_at_once
     with evaluating(mixture):
@@ -254,25 +239,19 @@ def sharpen(
         score = partial(mixture.occupancies, gate=gate)
         asked = asked_by(mixture, score, in_chunks(rays, at_once), rendering)
         of_each = [of_one for of_one, _ in cameras]
-        of_cameras = [
-            _said_by(mixture, score, one, seen_reference(mixture, one)) for one in of_each
-        ]
+        seen = [seen_reference(mixture, of_one) for of_one in of_each]
+        of_cameras = list(map(partial(_said_by, mixture, score), of_each, seen))
         measured = calibrate(asked, calibration, cameras=of_cameras)
-        promised = promise(of_cameras, measured, calibration)
-    return Sharpened(gate, measured, before, promised)
+        return Sharpened(gate, measured, before, promise(of_cameras, measured, calibration))
 
 
 @torch.no_grad()
 def lesson_by(
     mixture: Mixture, rays: Rays, losses: GateLossConfig, seen: float, rays_at_once: int
 ) -> Lesson:
-    """What a field has to teach along rays: the targets of the contribution loss at all candidates.
-
-    Args:
-        rays: cut to the mixture's region.
-        losses: w_0 and k of the loss.
-        seen: share of the threshold from which a candidate is rendered; 0 renders all.
-    """
+    """What a field has to teach along rays, cut to the mixture's region: the targets of the
+    contribution loss at all candidates. Those are rendered whose o(x) is at least the share `seen`
+    of the threshold; 0 renders all."""
     lessons = []
     for chunk in in_chunks(rays, rays_at_once):
         asked = _asked(mixture, chunk, seen)
