@@ -142,12 +142,15 @@ class Run:
     """A training run as nerfstudio's trainer makes it, of the same batch in every step."""
 
     def __init__(self, config: TrainerConfig, seed: int) -> None:
+        self.model = build(config.pipeline.model, seed)
+        self.begin(config, self.model)
+
+    def begin(self, config: TrainerConfig, owner: Any) -> None:
+        """Makes optimizers and callbacks of a model, or of a pipeline."""
         from nerfstudio.engine.optimizers import Optimizers
 
-        self.model = build(config.pipeline.model, seed)
-        groups = self.model.get_param_groups()
-        self.optimizers = Optimizers(copy.deepcopy(config.optimizers), groups)
-        self.callbacks = callbacks(self.model, self.optimizers)
+        self.optimizers = Optimizers(copy.deepcopy(config.optimizers), owner.get_param_groups())
+        self.callbacks = callbacks(owner, self.optimizers)
 
     def step(self, step: int) -> float:
         """Takes a step, with random numbers of its own; returns the loss."""
@@ -270,18 +273,12 @@ class RunOnImages(Run):
     """A training run with the method's own pipeline and data manager."""
 
     def __init__(self, config: Any) -> None:
-        from nerfstudio.engine.callbacks import TrainingCallbackAttributes
-        from nerfstudio.engine.optimizers import Optimizers
-
         self._seed(0)
         with quietly():
             self.pipeline = config.pipeline.setup(device="cpu", test_mode="val")
             self.pipeline.train()
             self.model = self.pipeline.model
-            groups = self.pipeline.get_param_groups()
-            self.optimizers = Optimizers(copy.deepcopy(config.optimizers), groups)
-            attributes = TrainingCallbackAttributes(self.optimizers, None, self.pipeline, None)
-            self.callbacks = self.pipeline.get_training_callbacks(attributes)
+        self.begin(config, self.pipeline)
 
     @staticmethod
     def _seed(seed: int) -> None:

@@ -207,13 +207,17 @@ def build(config: Any, seed: int = 0) -> Model:
     return model
 
 
-def callbacks(model: Model, optimizers: Any = None) -> list[TrainingCallback]:
-    """What a model wants to be called at in a run; asking for it is what begins one."""
+def callbacks(owner: Any, optimizers: Any = None) -> list[TrainingCallback]:
+    """What a model, or a pipeline, wants to be called at in a run; asking for it is what begins
+    one."""
     from nerfstudio.engine.callbacks import TrainingCallbackAttributes
+    from nerfstudio.pipelines.base_pipeline import Pipeline
 
-    attributes = TrainingCallbackAttributes(optimizers, None, pipeline_of(model), None)
+    pipeline: Any = owner if isinstance(owner, Pipeline) else pipeline_of(owner)
+    attributes = TrainingCallbackAttributes(optimizers, None, pipeline, None)
     with quietly():
-        return model.get_training_callbacks(attributes)
+        found: list[TrainingCallback] = owner.get_training_callbacks(attributes)
+    return found
 
 
 def loss_of(model: Model, rays: RayBundle, batch: dict[str, Tensor], forward: Any = None) -> Tensor:

@@ -254,47 +254,35 @@ def lesson_by(
     of the threshold; 0 renders all."""
     lessons = []
     for chunk in in_chunks(rays, rays_at_once):
-        asked = _asked(mixture, chunk, seen)
-        before = ~backdrop_of(asked.intervals, chunk)
-        weights = torch.zeros_like(asked.occupancies)
-        weights[asked.drawn] = mixture.weigh(chunk, asked.some)
-        of_rays = asked.intervals.ray_indices[before]
-        lessons.append(lesson_of(asked.mapped[before], weights[before], of_rays, losses))
+        intervals, mapped, occupancies, drawn, some = _asked(mixture, chunk, seen)
+        before = ~backdrop_of(intervals, chunk)
+        weights = torch.zeros_like(occupancies)
+        weights[drawn] = mixture.weigh(chunk, some)
+        of_rays = intervals.ray_indices[before]
+        lessons.append(lesson_of(mapped[before], weights[before], of_rays, losses))
     return Lesson(*(torch.cat(parts) for parts in zip(*lessons)))
 
 
-class _Asked(NamedTuple):
-    """The candidates of rays, and which of them the field is asked about."""
-
-    intervals: Intervals
-    mapped: Tensor
-    """[M, 3] in [-1, 1], where they lie."""
-    occupancies: Tensor
-    """[M] o(x)."""
-    drawn: Tensor
-    """[M] bool: those that are rendered."""
-
-    @property
-    def some(self) -> Intervals:
-        """Those."""
-        return Intervals(*(part[self.drawn] for part in self.intervals))
-
-
 @torch.no_grad()
-def _asked(mixture: Mixture, rays: Rays, seen: float) -> _Asked:
+def _asked(
+    mixture: Mixture, rays: Rays, seen: float
+) -> tuple[Intervals, Tensor, Tensor, Tensor, Intervals]:
+    """The candidates of rays, where they lie [M, 3] in [-1, 1], their o(x) [M], which of them are
+    rendered, bool [M], and those alone."""
     intervals = mixture.with_backdrops(rays, mixture.candidates(rays))
     mapped = mapped_middles(mixture.region.space, rays, intervals)
     occupancies = mixture.occupancies(mapped)
     drawn = (occupancies >= seen * mixture.threshold) | backdrop_of(intervals, rays)
-    return _Asked(intervals, mapped, occupancies, drawn)
+    some = Intervals(*(part[drawn] for part in intervals))
+    return intervals, mapped, occupancies, drawn, some
 
 
 @torch.no_grad()
 def seen_reference(mixture: Mixture, rays: Rays) -> Reference:
     """As `dense_reference`, where candidates below the threshold are not rendered and have no
     weight. Guided training has not taught the field what is there."""
-    intervals, _, occupancies, drawn = asked = _asked(mixture, rays, 1.0)
-    small = reference_of(mixture.shade(rays, asked.some), asked.some, rays)
+    intervals, _, occupancies, drawn, some = _asked(mixture, rays, 1.0)
+    small = reference_of(mixture.shade(rays, some), some, rays)
     weights, surface = torch.zeros_like(occupancies), torch.zeros_like(drawn)
     weights[drawn], surface[drawn] = small.weights.float(), small.near_surface
     backdrops = backdrop_of(intervals, rays)
