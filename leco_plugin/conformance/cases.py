@@ -18,9 +18,6 @@ from leco_plugin.conformance.scene import SLAB
 from leco_plugin.samplers.registry import GROUP, SamplerSpec, sampler_spec, samplers, why_left_out
 from leco_plugin.scenes.input_error import InputError
 
-HOST_RULES = tuple(rule for rule in RULES if HostCase.seam in rule.checks)
-SAMPLER_RULES = tuple(rule for rule in RULES if rule not in HOST_RULES)
-
 
 def sampler_cases(name: str) -> list[Case]:
     """A registered sampler at each seam that it serves.
@@ -80,9 +77,9 @@ def cases_of(name: str) -> list[Case]:
     return host_cases(name)
 
 
-def pairs(cases: list[Case], rules: tuple[Rule, ...] = RULES) -> list[tuple[Rule, Case]]:
+def pairs(cases: list[Case]) -> list[tuple[Rule, Case]]:
     """Each rule with each case at whose seam it has something to check."""
-    return [(rule, case) for case in cases for rule in rules if case.seam in rule.checks]
+    return [(rule, case) for case in cases for rule in RULES if case.seam in rule.checks]
 
 
 def check(name: str) -> Iterator[Verdict]:

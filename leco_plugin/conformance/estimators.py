@@ -53,9 +53,6 @@ from leco_plugin.samplers.marching import Samples
 from leco_plugin.samplers.packed import pack_info
 from leco_plugin.samplers.registry import build_estimator
 
-TEACHING_STEPS = (0, 16)
-"""Steps at which hosts of an occupancy grid refresh it, as nerfacc has it."""
-
 
 class EstimatorCase(SamplerCase):
     """A sampler with nerfacc's two verbs, `sampling` and `update_every_n_steps`."""
@@ -67,7 +64,7 @@ class EstimatorCase(SamplerCase):
 
     def teach(self, sampler: Any, scene: Slab) -> None:
         sampler.train()
-        for step in TEACHING_STEPS:
+        for step in (0, 16):  # at which hosts refresh an occupancy grid, as nerfacc has it
             sampler.update_every_n_steps(step=step, occ_eval_fn=scene.density)
 
     def sample(
@@ -103,8 +100,6 @@ class EstimatorCase(SamplerCase):
 
 NEAR, FAR = 2.5, 3.4
 """Planes that cut into some of the rays of `cut_short` at either end."""
-PLANES = ((NEAR, FAR), (0.05, 1e3))
-"""Near and far planes of hosts that give no t_min and t_max; the second are Instant-NGP's."""
 
 
 @checks("signature", "estimator")
@@ -137,8 +132,8 @@ def shapes_types_devices(case: EstimatorCase) -> None:
                 len(shapes[0]) == 1 and shapes[0] == shapes[1] == shapes[2] and shapes[0][0] > 0,
                 f"ray_indices, t_starts and t_ends have shapes {shapes}; expected [n_samples] each",
             )
-            for name, part in zip(PARTS, samples, strict=True):
-                require(part.device == rays.origins.device, f"{name} is on {part.device}")
+            where = samples[0].device
+            require(where == rays.origins.device, f"{PARTS[0]} is on {where}")
             for name, part in zip(PARTS[1:], samples[1:], strict=True):
                 check_tensor(name, part, rays.origins)
         sampler.to("cpu")
@@ -155,7 +150,7 @@ def sorted_disjoint_inside(case: EstimatorCase) -> None:
     planes: dict[str, Any] = {"near_plane": NEAR, "far_plane": FAR, "render_step_size": LONG_STEP}
     for training in (False, True):
         check_intervals(narrower, case.sample(sampler.train(training), many, **planes))
-    for near, far in PLANES:
+    for near, far in ((NEAR, FAR), (0.05, 1e3)):  # the second are Instant-NGP's
         _check_between_planes(case, sampler, near, far)
 
 

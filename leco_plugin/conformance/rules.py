@@ -85,7 +85,6 @@ class Verdict:
     """Whether a rule holds for a case."""
 
     rule: Rule
-    name: str
     seam: str
     error: Exception | None
     """What the check raised; None when the rule holds."""
@@ -153,7 +152,7 @@ def apply(rule: Rule, case: Case) -> Verdict:
         except Exception as caught:  # noqa: BLE001 (whatever a foreign sampler raises)
             case.forget()
             error = caught
-    return Verdict(rule, case.name, case.seam, error)
+    return Verdict(rule, case.seam, error)
 
 
 RULES = (
