@@ -347,7 +347,8 @@ class Learner:
         lowered = [*mixture.report.get("lowered", []), [step, found.threshold]]
         mixture.freeze(found.threshold, mixture.report | found._asdict() | {"lowered": lowered})
         watched.evidence = {}
-        now = "no threshold is low enough: from now on nothing is skipped"
+        now = "no threshold is low enough: " if below > 0.0 else ""
+        now += "from now on nothing is skipped"
         if found.threshold > 0.0:
             now = f"threshold {before:.4f} lowered to {found.threshold:.4f}, which {found.line}"
         say(f"step {step}: {why}; {now}")

@@ -314,9 +314,12 @@ def test_a_gate_that_keeps_nothing_near_the_end_stays_frozen_and_keeps_everythin
     watched.learner.held_out.lower = lower
     watched.run.end = 400
     watched.kept = 0.0
-    watched.go(280, 400)
+    watched.go(280, 381)
+    assert not watched.learner.progress.looks_collapsed, "else nothing would be saved"
+    watched.kept = 64.0
+    watched.go(381, 400)
     assert bool(watched.mixture.frozen) and float(watched.mixture.threshold) == 0.0
-    assert watched.run.saved == [380] and not watched.learner.progress.looks_collapsed
+    assert watched.run.saved == [380]
     occupancy = Occupancy.load(tmp_path / FILE_NAME)
     assert occupancy.threshold == 0.0 and occupancy.report["lowered"] == [[380, 0.0]]
     assert occupancy.report.items() >= measured._asdict().items(), "prices are as measured"
