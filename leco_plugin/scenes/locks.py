@@ -2,30 +2,22 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 from leco_plugin.scenes.input_error import InputError
 
-try:
-    import fcntl as _fcntl
-
-    fcntl: Any = _fcntl
-except ImportError:  # Windows has no such locks: there only checkpoints are looked for
-    fcntl = None
-
 LOCK = ".running"
-"""File that a run holds locked; the system lets go of it however the run ends, and one that ends by
-itself takes it away where there are such locks."""
+"""File that a run holds locked: the system lets go of it however the run ends."""
 
 
 @contextmanager
 def alone_in(folder: Path, work: str) -> Iterator[None]:
-    """Keeps a folder, made where it is missing, from other processes that would make the same
-    `work` in it. InputError if one is at work there, or it is no folder."""
+    """Makes a folder, and keeps other processes from the same `work` in it. InputError if one is at
+    work there, or it is no folder."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
@@ -43,11 +35,8 @@ def alone_in(folder: Path, work: str) -> Iterator[None]:
 
 
 def lock(folder: Path, tries: int = 5) -> int | None:
-    """An open file in a folder that is locked until it is closed, which the system does for a
-    process that ends; None where another process has locked it."""
+    """An open file in a folder, locked until it is closed; None where another process has it."""
     held = os.open(folder / LOCK, os.O_CREAT | os.O_RDWR, 0o644)
-    if fcntl is None:
-        return held
     try:
         fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -72,6 +61,6 @@ def _lies_in(folder: Path, held: int) -> bool:
 def unlock(folder: Path, held: int) -> None:
     """Takes the lock away while it is held, so that nobody else's is taken away."""
     with suppress(OSError):
-        if fcntl is not None and _lies_in(folder, held):
+        if _lies_in(folder, held):
             (folder / LOCK).unlink()
     os.close(held)

@@ -143,20 +143,3 @@ def test_a_config_goes_to_a_folder_of_its_own_and_says_so(
     assert "this run goes to" in " ".join(capsys.readouterr().out.split())
     for made in (first, second):
         release(made.get_base_dir())
-
-
-def test_the_methods_load_where_there_are_no_such_locks(folder: Path) -> None:
-    script = (
-        "import sys; sys.modules['fcntl'] = None\n"
-        "from pathlib import Path\n"
-        "from leco_plugin.studio.run_folder import claim\n"
-        "folder = Path(sys.argv[1])\n"
-        "print(claim(folder, folder / 'checkpoints', None))\n"
-        "(folder / 'checkpoints').mkdir()\n"
-        "(folder / 'checkpoints' / 'step-000000003.ckpt').touch()\n"
-        "print(claim(folder, folder / 'checkpoints', None))\n"
-    )
-    said = subprocess.run(
-        [sys.executable, "-c", script, str(folder)], capture_output=True, text=True, check=True
-    ).stdout.splitlines()
-    assert said[0] == "None" and "holds an earlier run" in said[1]
