@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -19,7 +20,7 @@ import tyro
 from leco_plugin.cli_experiments import capacity, chart, check, stability
 from leco_plugin.cli_occupancy import export, inspect, shrink
 from leco_plugin.scenes.input_error import one_line
-from leco_plugin.scenes.whole_files import check_json, write_report
+from leco_plugin.scenes.whole_files import check_place, write_report
 
 BAD_INPUT, FAILURE = 2, 1
 FEW_PICTURES = 20
@@ -62,7 +63,7 @@ def city(
         format: Of the scene: nerfstudio's, or Mega-NeRF's, for the data parser mega-nerf.
         json: File for what was written, as JSON.
     """
-    check_json(json)
+    check_place("--json", json)
     from leco_plugin.scenes.city.city import City, CityConfig
     from leco_plugin.scenes.city.folder import CaptureConfig, count_pictures, write_city
 
@@ -108,7 +109,7 @@ def poses(
         threads: Of the CPU. 0 takes all.
         json: Another file for poses.json.
     """
-    check_json(json)
+    check_place("--json", json)
     from leco_plugin.scenes.poses.command import make_scene, summary
 
     report = make_scene(photos, out, lens, size, threads)
@@ -135,7 +136,7 @@ def points(
         threads: Of the CPU. 0 takes all.
         json: File for what was found, as JSON.
     """
-    check_json(json)
+    check_place("--json", json)
     from leco_plugin.scenes.poses.points import find_points
 
     report = find_points(data, size, threads)
@@ -177,7 +178,7 @@ def swap(
 
     from leco_plugin.swap import swapped_config
 
-    check_json(json)
+    check_place("--json", json)
     config = swapped_config(method, occupancy, arguments, sampler, options, codes, other_scene)
     train(config)
     folder = config.get_base_dir()
@@ -204,12 +205,10 @@ def demo(
             nothing.
         json: Another file for the report.
     """
-    import time
-
     began = time.monotonic()
     from leco_plugin.demo import run_demo, summary
 
-    check_json(json)
+    check_place("--json", json)
     out = out or Path("runs/demo-quick" if quick else "runs/demo")
     report = run_demo(out, seconds, quick, began)
     print("\n".join(summary(report)))
@@ -222,33 +221,21 @@ def _training(data: Path, *reader: str) -> str:
     return shlex.join(["ns-train", "leco-occupancy", *reader, "--data", str(data)])
 
 
-COMMANDS: dict[str, Callable[..., None]] = {
-    command.__name__: command
-    for command in (
-        *(city, poses, points, inspect, export, shrink, capacity),
-        *(swap, demo, chart, stability, check),
-    )
-}
+LISTED = city, poses, points, inspect, export, shrink, capacity, swap, demo, chart, stability, check
+COMMANDS: dict[str, Callable[..., None]] = {command.__name__: command for command in LISTED}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs `leco`: 0, or one line on stderr and 2 for bad input, 1 for a failure."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    with warnings.catch_warnings():
-        # what nerfstudio and torch think of each other is nothing that a user can act on
-        warnings.filterwarnings("ignore", module=r"nerfstudio|torch")
-        return _run(given)
-
-
-def _run(given: list[str]) -> int:
-    """As `main`."""
+    about = "Learned occupancy for nerfstudio: what is empty is skipped."
     try:
-        tyro.extras.subcommand_cli_from_dict(
-            COMMANDS,
-            prog="leco",
-            description="Learned occupancy for nerfstudio: what is empty is skipped.",
-            args=given,
-        )
+        with warnings.catch_warnings():
+            # what nerfstudio and torch think of each other is nothing that a user can act on
+            warnings.filterwarnings("ignore", module=r"nerfstudio|torch")
+            tyro.extras.subcommand_cli_from_dict(
+                COMMANDS, prog="leco", description=about, args=given
+            )
     except (ValueError, OSError) as error:
         return _complain(error, BAD_INPUT)
     except SystemExit as end:

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from leco_plugin.scenes.whole_files import check_json, write_report
+from leco_plugin.scenes.whole_files import check_place, write_report
 
 
 def chart(
@@ -59,7 +59,7 @@ def chart(
             says; stretch a whole flight line or arc, whose neighbours are not trained on either.
         json: Another file for the results.
     """
-    check_json(json)
+    check_place("--json", json)
     from leco_plugin.chart.command import Asked, make_charts, refuse_failures
 
     asked = Asked(seconds, steps, learn_seconds, seeds, images, at_once, reuse, held_out)
@@ -103,7 +103,7 @@ def stability(
     from leco_plugin.stability.suite import make_table
     from leco_plugin.stability.table import blind, headline
 
-    check_json(json)
+    check_place("--json", json)
     results = make_table(out, cases, samplers, seeds, seeds_beside, quick, minutes)
     print(headline(results))
     print(f"see stability.png, table.md, stability.json and failures in {out}")
@@ -135,7 +135,7 @@ def capacity(
     """
     from leco_plugin.capacity.measuring import capacity as measure
 
-    check_json(json)
+    check_place("--json", json)
     results = measure(data, out, grids, lost_surface_mass, learn_steps)
     print(results["verdict"])
     print(f"see capacity.png and results.json in {out}")
@@ -151,7 +151,7 @@ def check(name: Annotated[str, tyro.conf.Positional], json: Path | None = None) 
         name: A registered sampler or nerfstudio method, of this package or of another.
         json: File for the verdicts as JSON.
     """
-    check_json(json)
+    check_place("--json", json)
     from leco_plugin.conformance.cases import check as verdicts_on
     from leco_plugin.log import kept_back
 

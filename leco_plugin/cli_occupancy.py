@@ -9,18 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from leco_plugin.scenes.whole_files import check_json, check_picture, write_report
+from leco_plugin.scenes.whole_files import check_picture, check_place, write_report
 
 if TYPE_CHECKING:
     from leco_plugin.occupancy import Occupancy
 
 
 def occupancy_of(path: Path) -> Path:
-    """The file that is meant: itself, or the newest occupancy in a folder of runs.
-
-    Raises:
-        ValueError: there is neither, or none in the folder.
-    """
+    """The file that is meant: itself, or the newest occupancy in a folder of runs. ValueError if
+    there is none."""
     give = (
         "give an occupancy.safetensors, or a folder with a run that left one, as "
         "outputs/SCENE/leco-occupancy"
@@ -58,7 +55,7 @@ def inspect(
         json: File for the same as JSON.
         dark: Draw the picture for a dark page.
     """
-    check_json(json)
+    check_place("--json", json)
     check_picture("--picture", picture)
     check_picture("--history", history, moving=True)
     from leco_plugin.evaluation.inspection import describe, doubts, scene_of
@@ -129,7 +126,7 @@ def export(
     """
     from leco_plugin import export as made
 
-    check_json(json)
+    check_place("--json", json)
     file = occupancy_of(file)
     if format is not None:
         facts = made.export(file, format, out, resolution, levels, frame, data)
@@ -144,18 +141,13 @@ def export(
 
 
 def _export_in_words(out: Path, facts: dict[str, Any], frame: str | None) -> list[str]:
-    """What was written, a line each.
-
-    Args:
-        frame: of points that was asked for.
-    """
+    """What was written, a line each; `frame` of points is the one that was asked for."""
     if facts["written"] == "npz":
         return [f"{out}: {facts['shape']} cells, {facts['kept_share_of_cells']:.2%} of them kept"]
     if facts["written"] == "nerfacc-grid":
-        levels, cells = facts["levels"], facts["resolution"]
-        kept = f"{facts['kept_share_of_cells']:.2%} of them kept"
+        levels, cells, kept = facts["levels"], facts["resolution"], facts["kept_share_of_cells"]
         return [
-            f"{out}: {levels} x {cells}^3 cells, {kept}",
+            f"{out}: {levels} x {cells}^3 cells, {kept:.2%} of them kept",
             f"for OccGridEstimator({facts['aabbs'][0]}, {cells}, {levels})",
         ]
     lines = [f"{out}: {facts['points']} points in the coordinates of the {facts['frame']}"]
@@ -168,8 +160,7 @@ def _export_in_words(out: Path, facts: dict[str, Any], frame: str | None) -> lis
     if "geographic_origin" in facts:
         lines.append(f"its origin on earth: {facts['geographic_origin']}")
     if splats:
-        data = shlex.quote(str(out))
-        command = f"ns-train splatfacto --data {data} leco-photographs"
+        command = f"ns-train splatfacto --data {shlex.quote(str(out))} leco-photographs"
         lines.append(f"start from it with: {command} (on a GPU)")
     if frame != facts["frame"] == "run":
         lines.append("the file does not say how its run moved the data: learn it anew to know")
@@ -207,7 +198,7 @@ def shrink(
     from leco_plugin.capacity.references import Bounds
     from leco_plugin.capacity.shrink import shrink as find_smaller
 
-    check_json(json)
+    check_place("--json", json)
     check_picture("--picture", picture)
     bounds = Bounds(lost_surface_mass, image_price)
     results = find_smaller(

@@ -10,7 +10,6 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from functools import cache
 from typing import Protocol, TextIO
 
 from rich.console import Console
@@ -24,7 +23,7 @@ SECONDS_TO_FIRST, SECONDS_A_LINE, SHARE_A_LINE = 10.0, 60.0, 0.05
 share of the work."""
 OF_A_DEVICE = ("leco_plugin.samplers.kernels.fused", "leco_plugin.models.compute.grouped")
 """Whose warnings are of the device of one process; all others have the same everywhere."""
-
+SCREEN, WIDE = Console(highlight=False), Console(width=120)
 
 _details: TextIO | None = None
 """The log file of the run that goes on."""
@@ -64,26 +63,13 @@ def console() -> Console:
     """The short screen of a run with a log file; else nerfstudio's console where that is loaded,
     else one as wide."""
     if _details is not None:
-        return _screen()
+        return SCREEN
     nerfstudio = sys.modules.get("nerfstudio.utils.rich_utils")
-    return _own_console() if nerfstudio is None else nerfstudio.CONSOLE
-
-
-@cache
-def _own_console() -> Console:
-    return Console(width=120)
-
-
-@cache
-def _screen() -> Console:
-    return Console(highlight=False)
+    return WIDE if nerfstudio is None else nerfstudio.CONSOLE
 
 
 def say(line: str) -> None:
-    """A line on the screen, said once for all processes; also in the run's log file.
-
-    It is shown as it is: brackets and colons in the name of a file mean nothing.
-    """
+    """A line on the screen, as it is, said once for all processes; also in the run's log file."""
     if is_first() and _details is not None and _kept_back is None:
         put(line)
     else:
@@ -97,11 +83,8 @@ def say_all(lines: Iterable[str]) -> None:
 
 
 def note(line: str, offset: int = 2) -> None:
-    """A detail: a line in the run's log file; where there is none, as `say`.
-
-    Args:
-        offset: calls up to the one whose place in the code rich names.
-    """
+    """A detail: a line in the run's log file; where there is none, as `say`. The `offset` is of
+    calls up to the one whose place in the code rich names."""
     if not is_first():
         return
     if _kept_back is not None:
@@ -116,8 +99,7 @@ def summarize(summary: Iterable[str], details: Iterable[str]) -> None:
     """Notes details, of which a short screen shows a summary instead."""
     for line in details:
         note(line)
-    for line in summary if on_screen() else ():
-        say(line)
+    say_all(summary if on_screen() else ())
 
 
 def _write(line: str) -> None:
@@ -127,7 +109,7 @@ def _write(line: str) -> None:
 
 
 class _Says(logging.Handler):
-    """Says what samplers and experts warn of, and notes what else they log."""
+    """Says what the package's loggers warn of, and notes what else they log."""
 
     def emit(self, record: logging.LogRecord) -> None:
         line = record.getMessage()

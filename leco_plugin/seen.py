@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import zlib
-from typing import Any
 
 import numpy as np
 import torch
@@ -25,15 +24,11 @@ RAYS_AT_ONCE = 1 << 14
 
 
 class SeenSpace(nn.Module):
-    """Which cells of the mapped cube [-1, 1]^3 training rays cross, or come near.
-
-    Before any ray is noted, all space counts as seen.
-
-    Attributes:
-        cells: bool [n, n, n], n = `CELLS`.
-    """
+    """Which cells of the mapped cube [-1, 1]^3 training rays cross, or come near: all, before any
+    ray is noted."""
 
     cells: Tensor
+    """bool [n, n, n], n = `CELLS`."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -46,13 +41,10 @@ class SeenSpace(nn.Module):
 
     @torch.no_grad()
     def note(self, space: Space, rays: marching.Rays) -> None:
-        """Notes the rays that cover all training images, in place of those noted before.
+        """Notes the rays that cover all training images, from where they enter the scene to where
+        they leave it, in place of those noted before; `space` is on their device.
 
         A cell beside a crossed one counts as seen: rays are lines, and pixels have a width.
-
-        Args:
-            space: the mapping, on the device of the rays.
-            rays: from where they enter the scene to where they leave it.
         """
         cell = 2.0 / CELLS
         # beyond the inner cube mapped steps shrink at least as fast as distance grows
@@ -79,12 +71,6 @@ class SeenSpace(nn.Module):
         bits = np.packbits(self.cells.cpu().numpy()).tobytes()
         return torch.tensor(list(zlib.compress(bits, 9)), dtype=torch.uint8)
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
-        """A state without cells changes nothing: older ones have none, and nerfstudio loads in two
-        parts."""
-        if f"{prefix}cells" in state_dict:
-            super()._load_from_state_dict(state_dict, prefix, *rest)
-
 
 def cells_at(mapped: Tensor) -> Tensor:
     """Flat numbers of the cells at mapped positions [N, 3] in [-1, 1]: int32 [N]."""
@@ -94,11 +80,7 @@ def cells_at(mapped: Tensor) -> Tensor:
 
 
 def cells_from_bytes(data: Tensor) -> Tensor:
-    """The cells that `SeenSpace.to_bytes` compressed: bool [n, n, n].
-
-    Raises:
-        ValueError: it is something else.
-    """
+    """The cells that `SeenSpace.to_bytes` compressed: bool [n, n, n]. ValueError for other data."""
     if data.dtype != torch.uint8 or data.dim() != 1 or len(data) > 2 * BYTES:
         raise ValueError(f"cells are at most {2 * BYTES} bytes in a row")
     reader = zlib.decompressobj()

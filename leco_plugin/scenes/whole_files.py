@@ -32,8 +32,8 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
 
 def write_json(path: Path, value: Any, indent: int = 2, allow_nan: bool = False) -> None:
-    """Writes JSON whole or not at all; parents are made. NaN and infinity raise `ValueError`, but
-    in the copy of a user's file."""
+    """Writes JSON whole or not at all; parents are made. NaN and infinity raise ValueError unless
+    allowed, as in the copy of a user's file."""
     text = json.dumps(value, indent=indent, allow_nan=allow_nan) + "\n"
     write_whole(path, lambda file: file.write(text.encode()))
 
@@ -58,24 +58,14 @@ def write_points(path: Path, rows: NDArray[Any], comments: Sequence[str] = ()) -
         kind, shape = rows.dtype[field].subdtype or (rows.dtype[field], (1,))
         named = names.split()[: shape[0]]
         properties += [f"property {PLY_TYPES[kind.str[1:]]} {name}" for name in named]
-    count = f"element vertex {len(rows)}"
-    said = [f"comment {comment}" for comment in comments]
-    encoding = "format binary_little_endian 1.0"
-    head = ["ply", encoding, *said, count, *properties, "end_header\n"]
+    head = ["ply", "format binary_little_endian 1.0", *(f"comment {each}" for each in comments)]
+    head += [f"element vertex {len(rows)}", *properties, "end_header\n"]
     write_whole(path, lambda file: file.write("\n".join(head).encode() + rows.tobytes()))
 
 
-def check_json(path: Path | None) -> None:
-    """Before work that takes minutes, whether its report has a place."""
-    check_place("--json", path)
-
-
 def check_place(option: str, path: Path | None) -> None:
-    """Whether a file may be written there, its folders made.
-
-    Raises:
-        ValueError: it is a folder, or one of its folders is a file or cannot be written to.
-    """
+    """ValueError if a file cannot be written there: it is a folder, or one of its folders is a file
+    or cannot be written to."""
     if path is None:
         return
     if path.is_dir():
@@ -88,13 +78,8 @@ def check_place(option: str, path: Path | None) -> None:
 
 
 def check_picture(option: str, path: Path | None, moving: bool = False) -> None:
-    """As `check_place`, and whether a picture of this kind can be drawn.
-
-    Args:
-        moving: whether a .gif may be asked for, too.
-    Raises:
-        ValueError: as `check_place`, or its kind is not known.
-    """
+    """As `check_place`; ValueError also for a kind of picture that is not known. `moving` ones may
+    be a .gif, too."""
     check_place(option, path)
     if path is None:
         return
