@@ -1,8 +1,5 @@
-"""The lens of each frame of a transforms.json, whichever program wrote it.
-
-nerfstudio's readers know one lens model per scene, and each of them leaves out some fields. What a
-file says is read here, so that every reader's cameras can be held to it.
-"""
+"""The lens of each frame of a transforms.json. nerfstudio's readers know one lens model per scene,
+and each leaves out some fields: what a file says is read here, and their cameras are held to it."""
 
 from __future__ import annotations
 
@@ -20,12 +17,12 @@ DISTORTIONS = ("k1", "k2", "k3", "k4", "p1", "p2")
 PINHOLE_FIELDS = ("w", "h", "fl_x", "fl_y", "cx", "cy")
 ANGLES = ("x_fov", "y_fov", "camera_angle_x", "camera_angle_y", "fovx", "fovy")
 """Fields of view: what instant-ngp and Blender write beside or instead of focal lengths."""
-KINDS = ("camera_model", "is_fisheye")
 OTHER_LENSES = ("k5", "k6", "s1", "s2", "s3", "s4", "b1", "b2", "skew", "omega", "xi")
 """Coefficients that programs write and nerfstudio's cameras lack."""
 OTHER_MODES = ("latlong", "equirectangular", "orthographic", "lens_mode", "lens_model")
 FTHETA = tuple(f"ftheta_p{number}" for number in range(5))
-LENS_FIELDS = {*DISTORTIONS, *PINHOLE_FIELDS, *ANGLES, *KINDS, *OTHER_LENSES, *OTHER_MODES, *FTHETA}
+OTHERS = (*OTHER_LENSES, *OTHER_MODES, *FTHETA)
+LENS_FIELDS = {*DISTORTIONS, *PINHOLE_FIELDS, *ANGLES, *OTHERS, "camera_model", "is_fisheye"}
 LENS_FIELDS |= {"distortion_params", "rolling_shutter", "fisheye_crop_radius"}
 MIXED = {CameraType.PERSPECTIVE, CameraType.FISHEYE}
 """Types that one scene may have side by side."""
@@ -75,32 +72,22 @@ def lens_of(meta: dict[str, Any], frame: dict[str, Any], where: str) -> Lens:
         value = frame.get(name, meta.get(name))
         return None if value is None else _number(value, name, where, positive)
 
-    _refuse_other_lenses(meta, frame, where)
+    _refuse_other_lenses(meta | frame, where)
     (fx, angle_x), (fy, angle_y) = (_focal(meta, frame, axis, where) for axis in "xy")
-    kind = _kind(meta, frame, where)
+    kind = _kind(meta | frame, where)
     distortion = _distortion(frame, kind, where) or _distortion(meta, kind, where)
-    return Lens(
-        kind,
-        fx,
-        fy,
-        said("cx", positive=False),
-        said("cy", positive=False),
-        said("w"),
-        said("h"),
-        distortion,
-        angle_x,
-        angle_y,
-        said("fisheye_crop_radius") if kind in FISHEYES else None,
-    )
+    cx, cy = said("cx", positive=False), said("cy", positive=False)
+    width, height = said("w"), said("h")
+    radius = said("fisheye_crop_radius") if kind in FISHEYES else None
+    return Lens(kind, fx, fy, cx, cy, width, height, distortion, angle_x, angle_y, radius)
 
 
 def set_lenses(cameras: Cameras, lenses: list[Lens | None], factors: list[int]) -> None:
     """Gives each camera of the pictures' sizes its lens, in place; of None it keeps its own.
     Pictures are smaller by `factors` than lenses are for."""
     for name in ("fx", "fy", "cx", "cy", "camera_type", "distortion_params"):
-        shared = getattr(cameras, name)  # by all cameras, where they were given one value
-        own = None if shared is None else shared.expand(len(lenses), -1).clone()
-        setattr(cameras, name, own)
+        if (shared := getattr(cameras, name)) is not None:  # by all, where they had one value
+            setattr(cameras, name, shared.expand(len(lenses), -1).clone())
     for number, (lens, factor) in enumerate(zip(lenses, factors)):
         if lens is None:
             continue
@@ -127,8 +114,7 @@ def set_lenses(cameras: Cameras, lenses: list[Lens | None], factors: list[int]) 
 
 
 def check_together(lenses: list[Lens], where: str) -> None:
-    """InputError if frames are neither of one type nor perspective and fisheye, or if fisheyes
-    show several circles."""
+    """InputError if frames mix types other than perspective and fisheye, or circles of fisheyes."""
     kinds = {lens.kind or CameraType.PERSPECTIVE for lens in lenses}
     if len(kinds) > 1 and not kinds <= MIXED:
         names = " and ".join(sorted(kind.name for kind in kinds))
@@ -171,9 +157,8 @@ def _focal(
     return None, None
 
 
-def _kind(meta: dict[str, Any], frame: dict[str, Any], where: str) -> CameraType | None:
+def _kind(owner: dict[str, Any], where: str) -> CameraType | None:
     """The type of a frame's camera; None where nothing is said."""
-    owner = meta | frame
     model = owner.get("camera_model")
     if "camera_model" in owner and model not in list(CAMERA_MODEL_TO_TYPE):
         known = ", ".join(CAMERA_MODEL_TO_TYPE)
@@ -187,8 +172,7 @@ def _kind(meta: dict[str, Any], frame: dict[str, Any], where: str) -> CameraType
 
 
 def _distortion(owner: dict[str, Any], kind: CameraType | None, where: str) -> list[float] | None:
-    """In nerfstudio's order; None where a scene or a frame says nothing. InputError if nerfstudio
-    would drop some of it."""
+    """In nerfstudio's order; None if nothing is said. InputError if nerfstudio would drop some."""
     values = [_number(owner.get(name, 0), name, where) for name in DISTORTIONS]
     if "distortion_params" in owner:
         listed = owner["distortion_params"]
@@ -201,9 +185,7 @@ def _distortion(owner: dict[str, Any], kind: CameraType | None, where: str) -> l
         if len(listed) != (12 if kind is CameraType.FISHEYE624 else len(DISTORTIONS)):
             raise InputError(f"{where}: distortion_params has {len(listed)} numbers: give {wanted}")
         if any(values) and values != listed:
-            raise InputError(
-                f"{where}: distortion_params and {DISTORTIONS[0]}.. differ: remove one"
-            )
+            raise InputError(f"{where}: distortion_params and k1.. differ: remove one")
         values = listed
     elif not any(name in owner for name in DISTORTIONS):
         return None
@@ -215,10 +197,9 @@ def _distortion(owner: dict[str, Any], kind: CameraType | None, where: str) -> l
     return values
 
 
-def _refuse_other_lenses(meta: dict[str, Any], frame: dict[str, Any], where: str) -> None:
+def _refuse_other_lenses(owner: dict[str, Any], where: str) -> None:
     """InputError for what would be dropped."""
-    owner = meta | frame
-    for name in (*OTHER_LENSES, *OTHER_MODES, *FTHETA):
+    for name in OTHERS:
         if owner.get(name) not in (None, 0, False, "perspective", "Perspective", "OpenCV"):
             raise InputError(
                 f"{where}: {name} describes a lens that nerfstudio's cameras lack: undistort the "

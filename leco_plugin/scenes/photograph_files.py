@@ -40,7 +40,6 @@ TURNS = {
     8: Image.Transpose.ROTATE_90,
 }
 """What sets an image upright, by EXIF's orientation."""
-ANOTHER_FOLDER = "give another folder for derived pictures with --cache"
 
 
 class Header(NamedTuple):
@@ -78,10 +77,8 @@ def header_of(path: Path) -> Header:
             turned, kind = _orientation(image), image.format or ""
             return Header(image.size, image.mode, transparent, turned, several, kind)
     except Image.DecompressionBombError:
-        most = 2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6
-        raise InputError(
-            f"{path} has more than the {most:.0f} megapixels that Pillow opens: make it smaller"
-        ) from None
+        most = f"{2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f} megapixels that Pillow opens"
+        raise InputError(f"{path} has more than the {most}: make it smaller") from None
     except (OSError, ValueError, EOFError, SyntaxError):
         if not path.exists():
             raise InputError(f"the image {path} is not there{remedy_for_missing(path)}") from None
@@ -108,10 +105,9 @@ def find_file(path: Path) -> Path:
 def check_images(paths: list[Path]) -> None:
     """InputError if an image is not there."""
     if missing := [path for path in paths if not path.exists()]:
-        raise InputError(
-            f"{len(missing)} of {len(paths)} images are not there, the first is "
-            f"{missing[0]}{remedy_for_missing(missing[0])}"
-        )
+        count, first = f"{len(missing)} of {len(paths)}", missing[0]
+        why = remedy_for_missing(first)
+        raise InputError(f"{count} images are not there, the first is {first}{why}")
 
 
 def remedy_for_missing(path: Path) -> str:
@@ -147,9 +143,9 @@ def plain(image: Image.Image) -> Image.Image:
     """The same colours of an image that passes `check_kind`, in a mode that nerfstudio reads."""
     if image.mode in ("LA", "PA") or "transparency" in image.info:
         return image.convert("RGBA")
-    return (
-        image if image.mode in READ_RIGHTLY else image.convert("L" if image.mode == "1" else "RGB")
-    )
+    if image.mode in READ_RIGHTLY:
+        return image
+    return image.convert("L" if image.mode == "1" else "RGB")
 
 
 def is_turned(header: Header, size: tuple[int, int]) -> bool:
@@ -158,8 +154,8 @@ def is_turned(header: Header, size: tuple[int, int]) -> bool:
 
 
 def decode(path: Path, turn: bool) -> Image.Image:
-    """The plain colours of an image, turned as EXIF says if asked; its EXIF stays as it was.
-    InputError if it has none."""
+    """The plain colours of an image, with its EXIF, turned as that says if asked. InputError if it
+    has none."""
     try:
         with opened(path) as image:
             image.load()  # Pillow itself turns TIFF here
@@ -168,12 +164,11 @@ def decode(path: Path, turn: bool) -> Image.Image:
             return plain(image if turning is None else image.transpose(turning)).copy()
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         reason = one_line(error, 120)
-    raise InputError(f"{path} cannot be read ({reason}): is the file whole?")
+        raise InputError(f"{path} cannot be read ({reason}): is the file whole?") from None
 
 
 def names_what_it_cannot_read(dataset: Any) -> Any:
-    """A dataset of nerfstudio's which says in one line which of its images, or what comes with it,
-    cannot be read."""
+    """A dataset of nerfstudio's, whose InputError names an image that cannot be read."""
     read, paths = dataset.get_data, dataset.image_filenames
 
     def read_or_name(image_idx: int, *arguments: Any, **options: Any) -> Any:
@@ -191,16 +186,16 @@ def names_what_it_cannot_read(dataset: Any) -> Any:
 
 
 class DerivedImages:
-    """A folder of PNG files that are made when they are first asked for. Names depend on the source
-    (path, size, time of change) and the recipe, so that a changed source is never taken for the old
-    one. `remedy` is for where nothing can be written."""
+    """A folder of PNG files that are made when they are first asked for, and again once their
+    source has changed. `remedy` is for where nothing can be written."""
 
-    def __init__(self, folder: Path, remedy: str = ANOTHER_FOLDER) -> None:
+    def __init__(
+        self, folder: Path, remedy: str = "give another folder for derived pictures with --cache"
+    ) -> None:
         self.folder, self.remedy = folder, remedy
 
     def get(self, source: Path, recipe: str, make: Callable[[], Image.Image]) -> Path:
-        """The file with what `make` makes of `source`; `recipe` names it. InputError if nothing can
-        be written."""
+        """The file with what `make` makes of `source`; `recipe` names it. InputError as `put`."""
         status = source.stat()
         known_by = f"{source.resolve()} {status.st_size} {status.st_mtime_ns} {recipe}"
         digest = hashlib.blake2b(known_by.encode(), digest_size=8).hexdigest()
@@ -214,9 +209,8 @@ class DerivedImages:
         try:
             write_whole(path, lambda file: image.save(file, format="PNG"))
         except OSError as error:
-            raise InputError(
-                f"{path} cannot be written ({error.strerror or error}); {self.remedy}"
-            ) from None
+            why = error.strerror or error
+            raise InputError(f"{path} cannot be written ({why}); {self.remedy}") from None
 
 
 def open_image(path: Path, pixels: bool = True) -> Image.Image:
@@ -244,11 +238,9 @@ def convert_masks(
     derived: DerivedImages,
     speak: bool,
 ) -> list[Path]:
-    """Files of the masks in which every pixel that is seen is light, and every other is 0.
-
-    A mask that nerfstudio would read otherwise goes into `derived`; `sizes` are width and height of
-    its images; `speak` says what was taken for seen. InputError, in one line, about the mask.
-    """
+    """Files of the masks in which every pixel that is seen is light, and every other is 0: one that
+    nerfstudio would read otherwise goes into `derived`. `sizes` are width and height of images;
+    `speak` says what was taken for seen. InputError about a mask."""
     found, shown, grey = [], [], []
     for wanted, image, size in zip(masks, images, sizes):
         path = _found(wanted, image)
@@ -282,8 +274,7 @@ def convert_masks(
 
 
 def seen_pixels(mask: Path, image: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """The pixels [H, W] that a mask shows of an image of a width and height. InputError, one line,
-    about it."""
+    """The pixels [H, W] that a mask shows of an image of this width and height; or InputError."""
     path = _found(mask, image)
     return _fit(_is_seen(_values(path)), size, path)
 
@@ -292,19 +283,16 @@ def check_masked(frames: list[dict[str, Any]], folder: Path) -> None:
     """InputError if some frames have a mask, and some have none."""
     masked = sum("mask_path" in frame for frame in frames)
     if 0 < masked < len(frames):
-        raise InputError(
-            f"{folder}: {masked} of {len(frames)} images have a mask_path; "
-            "give one to all or to none"
-        )
+        count = f"{masked} of {len(frames)} images have a mask_path"
+        raise InputError(f"{folder}: {count}; give one to all or to none")
 
 
 def _found(path: Path, image: Path) -> Path:
     """The file of a mask: of full size where there is no smaller one, or named as COLMAP does."""
     folders = [path.parent]
     for place, part in enumerate(path.parts[:-1]):
-        if re.search(r"._\d+$", part):
-            full = re.sub(r"_\d+$", "", part)
-            folders.append(Path(*path.parts[:place], full, *path.parts[place + 1 : -1]))
+        if smaller := re.fullmatch(r"(.+)_\d+", part):
+            folders.append(Path(*path.parts[:place], smaller[1], *path.parts[place + 1 : -1]))
     for folder in folders:
         for name in (path.name, f"{image.name}.png", f"{image.stem}.png"):
             if (folder / name).is_file():
@@ -324,16 +312,15 @@ def _values(path: Path) -> NDArray[np.uint8]:
                 return np.ceil(deep * (255.0 / max(deep.max(), 1e-9))).astype(np.uint8)
             rgba = np.asarray(image.convert("RGBA")).astype(np.int16)
     except Exception as error:  # noqa: BLE001  decoders raise whatever they meet
-        reason = one_line(error, 120)
-    else:
-        lightest, darkest = rgba[..., :3].max(axis=-1), rgba[..., :3].min(axis=-1)
-        if bool(((lightest - darkest)[rgba[..., 3] > 0] > COLOURED).any()):
-            raise InputError(
-                f"the mask {path} has colours: save it in black, where its image is not to be "
-                "used, and white"
-            )
-        return (lightest * rgba[..., 3] // 255).astype(np.uint8)
-    raise InputError(f"the mask {path} cannot be read as an image ({reason}): is the file whole?")
+        why = f"({one_line(error, 120)}): is the file whole?"
+        raise InputError(f"the mask {path} cannot be read as an image {why}") from None
+    lightest, darkest = rgba[..., :3].max(axis=-1), rgba[..., :3].min(axis=-1)
+    if bool(((lightest - darkest)[rgba[..., 3] > 0] > COLOURED).any()):
+        raise InputError(
+            f"the mask {path} has colours: save it in black, where its image is not to be used, "
+            "and white"
+        )
+    return (lightest * rgba[..., 3] // 255).astype(np.uint8)
 
 
 def _is_seen(values: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -347,11 +334,9 @@ def _fit(seen: NDArray[np.bool_], size: tuple[int, int], path: Path) -> NDArray[
     high, wide = seen.shape
     if (wide, high) == size:
         return seen
-    factor = max(1, round(wide / size[0]))
-    if factor == 1 or any(
-        abs(full - factor * part) > factor for full, part in zip((wide, high), size)
-    ):
-        raise InputError(
-            f"the mask {path} has {wide} x {high} pixels, its image {size[0]} x {size[1]}"
-        )
+    factor = round(wide / size[0])
+    off = max(abs(wide - factor * size[0]), abs(high - factor * size[1]))
+    if factor <= 1 or off > factor:
+        sizes = f"{wide} x {high} pixels, its image {size[0]} x {size[1]}"
+        raise InputError(f"the mask {path} has {sizes}")
     return np.asarray(Image.fromarray(seen).resize(size, Image.Resampling.NEAREST))

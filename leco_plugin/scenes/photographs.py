@@ -1,8 +1,5 @@
-"""The default reader of photographs: nerfstudio's own format, the usual mistakes named in one line.
-
-Beyond nerfstudio's parser it checks the folder before anything is loaded, leaves scenes that are
-already upright as they are, and reads the sparse points without open3d.
-"""
+"""The default reader of photographs: nerfstudio's own format, the usual mistakes named in one line,
+scenes left upright that are so already, sparse points read without open3d."""
 
 from __future__ import annotations
 
@@ -34,7 +31,7 @@ from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.large_coordinates import ReadsNear
 from leco_plugin.scenes.photograph_files import check_images, find_file
 from leco_plugin.scenes.reading import CheckedReader
-from leco_plugin.scenes.scene_file import file_in, load_json, scene_file_of
+from leco_plugin.scenes.scene_file import SceneFile, file_in, load_json, scene_file_of
 
 COLOURS = "points3D_rgb"
 """That of their colours, uint8 [P, 3]. nerfstudio's pipelines want both or neither."""
@@ -79,8 +76,7 @@ class LecoPhotographs(CheckedReader, ReadsNear, Nerfstudio):
             frame = from_file(parsed_frame(outputs), applied, applied_scale, torch.float64)
         except (ValueError, TypeError, RuntimeError) as error:
             raise InputError(f"{data} cannot be read: {one_line(error, 120)}") from None
-        points = points_of(meta, folder_of(data))
-        if points is not None:
+        if (points := read_points(meta, folder_of(data))) is not None:
             outputs.metadata |= points_in_model(points, frame)
         if up_is_known:
             outputs.metadata[UP_IS_KNOWN] = True
@@ -131,24 +127,17 @@ def taken_from_above(poses: np.ndarray) -> bool:
     return bool(np.mean(poses[:, 2, 2] > 0.7) > 0.75)
 
 
-def check_scene(data: Path) -> dict[str, Any]:
-    """The description of a scene.
-
-    InputError: no such folder, no cameras or a single place, missing images, lenses that
-    nerfstudio's cameras lack, poses that are not poses.
-    """
+def read_scene(data: Path) -> SceneFile:
+    """The description of a scene. InputError as `scene_file_of`, or for missing images."""
     scene = scene_file_of(LecoPhotographsDataParserConfig(data=data), "train")
     assert scene is not None
     check_images(scene.pictures())
-    return scene.meta
+    return scene
 
 
-def points_of(meta: dict[str, Any], folder: Path) -> CloudFile | None:
-    """Sparse points in the coordinates of the file, or None when there are none.
-
-    A file that is named and not there, or empty, is said, for learning without points is slower.
-    InputError if it cannot be read.
-    """
+def read_points(meta: dict[str, Any], folder: Path) -> CloudFile | None:
+    """Sparse points in the coordinates of the file, or None; said where a file of them is named
+    that is not there or empty. InputError if it cannot be read."""
     name = meta.get("ply_file_path")
     if name is None:
         return None
@@ -164,8 +153,8 @@ def points_of(meta: dict[str, Any], folder: Path) -> CloudFile | None:
 
 
 def points_in_model(points: CloudFile, frame: Tensor) -> dict[str, Tensor]:
-    """Sparse points and colours, taken to the model by a frame [3, 4], as nerfstudio's own readers
-    return them: splatfacto starts there, from grey ones where the file has no colours."""
+    """Sparse points and colours as metadata of nerfstudio's readers, taken to the model by a frame
+    [3, 4]: splatfacto starts there, from grey ones where the file has no colours."""
     positions, colours = points
     if colours is None:
         colours = np.full(positions.shape, GREY, np.uint8)
@@ -173,33 +162,24 @@ def points_in_model(points: CloudFile, frame: Tensor) -> dict[str, Tensor]:
     return {POINTS: in_model, COLOURS: torch.from_numpy(colours)}
 
 
-def read_points(meta: dict[str, Any], folder: Path) -> Tensor | None:
-    """Those of `points_of` without colours [P, 3] float64, or None."""
-    points = points_of(meta, folder)
-    return None if points is None else torch.from_numpy(points.positions)
-
-
 def describe_held_out(data: Path, kind: HeldOut) -> dict[str, Any]:
     """Which photographs of a scene are tested, as JSON values: the `kind`, and of a stretch the
     names of those of `test` and of those `beside` it. InputError if none can be held out."""
-    names = stretch_of(check_scene(data), str(data)) if kind == "stretch" else {}
+    names = stretch_of(read_scene(data).meta, str(data)) if kind == "stretch" else {}
     return {"kind": kind} | {part: names[part] for part in names if part != "train"}
 
 
 def describe_scene(data: Path) -> dict[str, Any]:
-    """Name, number of images, and what tells the scene from another: JSON values. InputError if it
-    cannot be read."""
-    meta = check_scene(data)
+    """Name, number of images and digest of a scene, JSON values. InputError if none can be read."""
+    images = len(read_scene(data).meta["frames"])
     digest = hashlib.sha256(file_in(data).read_bytes()).hexdigest()
-    name = folder_of(data).resolve().name
-    return {"name": name, "images": len(meta["frames"]), "digest": digest[:16]}
+    return {"name": folder_of(data).resolve().name, "images": images, "digest": digest[:16]}
 
 
 def megapixels_of(data: Path) -> float | None:
     """Million pixels of a scene's first photograph; None where its file does not say them."""
-    scene = scene_file_of(LecoPhotographsDataParserConfig(data=data), "train")
-    lens = None if scene is None else scene.lenses[0]
-    if lens is None or lens.width is None or lens.height is None:
+    lens = read_scene(data).lenses[0]
+    if lens.width is None or lens.height is None:
         return None
     return lens.width * lens.height / 1e6
 
@@ -227,15 +207,12 @@ class Stretch(NamedTuple):
 def find_stretch(positions: Array) -> Stretch:
     """The stretch of cameras at [C, 3] near the middle that ends with the widest gap, by number.
 
-    It grows from the camera next to the middle, by the nearest camera each time, and so follows a
-    line or an arc whose cameras are nearer to each other than to those of the next line. ValueError
-    if there are too few cameras, or they stand too close together.
+    It grows by the nearest camera each time, and so follows a line or an arc. ValueError if there
+    are too few cameras, or they stand too close together.
     """
     count = len(positions)
     if count < FEWEST:
-        raise ValueError(
-            f"there are {count} cameras, and a stretch is held out of {FEWEST} or more"
-        )
+        raise ValueError(f"there are {count} cameras: a stretch is held out of {FEWEST} or more")
     order, gaps = _grow(positions)
     low, high = max(2, round(LEAST * count)), round(MOST * count)
     behind = gaps[low - 1 : high]  # behind a stretch of `low` cameras, and so on
@@ -276,8 +253,8 @@ def stretch_of(meta: dict[str, Any], scene: str) -> dict[str, list[str]]:
         found = find_stretch(poses[:, :3, 3])
     except ValueError as error:
         raise InputError(f"{scene}: {error}; hold out photographs of the spread instead") from None
-    names: dict[str, list[str]] = {"train": [], "test": [], "beside": []}
     kinds = dict.fromkeys(found.held_out, "test") | dict.fromkeys(found.beside, "beside")
+    names: dict[str, list[str]] = {"train": [], "test": [], "beside": []}
     for number, frame in enumerate(meta["frames"]):
         names[kinds.get(number, "train")].append(str(frame["file_path"]))
     return names

@@ -1,5 +1,5 @@
-"""A transforms.json, read and checked in one way for every reader of one; or, of a folder without
-one, which reader or converter of nerfstudio it is for."""
+"""A transforms.json, read and checked for all its readers; of a folder without one, which reader or
+converter of nerfstudio it is for."""
 
 from __future__ import annotations
 
@@ -64,8 +64,10 @@ def load_json(path: Path) -> Any:
     if not isinstance(said, dict):
         return said
     said = _without_nulls(said)
-    lists = {name: said[name] for name in FRAMES if isinstance(said.get(name), list)}
-    return said | {name: [_completed(frame) for frame in lists[name]] for name in lists}
+    for name in FRAMES:
+        if isinstance(said.get(name), list):
+            said[name] = [_completed(frame) for frame in said[name]]
+    return said
 
 
 @lru_cache(maxsize=1)
@@ -89,8 +91,8 @@ def _completed(frame: Any) -> Any:
 
 
 def read_scene_file(path: Path, split: str, folder: Path) -> SceneFile:
-    """A transforms.json, whose pictures are relative to `folder`. InputError if its poses and
-    lenses are none that cameras have, or all cameras of a training split are in one place."""
+    """A transforms.json, its pictures relative to `folder`. InputError if its poses or lenses are
+    none that cameras have, or all cameras of a training split are in one place."""
     try:
         meta = load_json(path)
         frames = [frame for name in FRAMES for frame in meta.get(name, [])]
@@ -101,14 +103,11 @@ def read_scene_file(path: Path, split: str, folder: Path) -> SceneFile:
         poses = np.array([frame["transform_matrix"] for frame in frames], dtype=float)
     except NO_SCENE as error:
         reason = f"{type(error).__name__}: {one_line(error, 120)}"
-        raise InputError(
-            f"{path} is not a scene in nerfstudio's format ({reason}); mend it, or make it "
-            "anew with ns-process-data"
-        ) from None
+        fault = f"is not a scene in nerfstudio's format ({reason}); mend it, or"
+        raise InputError(f"{path} {fault} make it anew with ns-process-data") from None
     if len(frames) == 0:
-        raise InputError(
-            f"{path} has no cameras: its list of frames is empty; make it anew with ns-process-data"
-        )
+        fault = "has no cameras: its list of frames is empty"
+        raise InputError(f"{path} {fault}; make it anew with ns-process-data")
     check_poses(poses, [f"{path}: the transform_matrix of {name}" for name in names])
     if split == "train" and np.ptp(poses[:, :3, 3], axis=0).max() == 0.0:
         number = "one image" if len(frames) == 1 else f"{len(frames)} images from one place"
@@ -143,7 +142,7 @@ def description_of(config: Any, split: str) -> Path | None:
 
 def scene_file_of(config: Any, split: str) -> SceneFile | None:
     """The transforms.json that a reader is about to read; None where it reads others. InputError if
-    it is not there, or nerfstudio would fail at it or read it wrongly."""
+    it is not there, or as `read_scene_file`."""
     data, file = Path(config.data), description_of(config, split)
     if file is None:
         return None
@@ -151,9 +150,8 @@ def scene_file_of(config: Any, split: str) -> SceneFile | None:
         raise InputError(f"there is no folder {data}: put it, or a link, there, or give another")
     if not file.exists():
         beside = sorted(file.parent.glob("transforms_*.json"))
-        instead = remedy_for(data) or (
-            "give a folder with one, or make one from photographs with leco poses"
-        )
+        instead = "give a folder with one, or make one from photographs with leco poses"
+        instead = remedy_for(data) or instead
         if file.name != "transforms.json" and beside:
             instead = f"give that split one, as a copy of {beside[0].name}"
         raise InputError(f"{data} holds no {file.relative_to(data)}; {instead}")
@@ -186,17 +184,12 @@ def frames_of(images: list[Path], scene: SceneFile) -> list[int | None]:
     for image in images:
         numbers = named.get(image.name) or named.get(image.stem) or []
         paths = [scene.folder / places[number] for number in numbers]
-        ends = [
-            number
-            for number, path in zip(numbers, paths)
-            if image in (path, path.with_name(f"{path.name}{image.suffix}"))
-        ]
+        files = [(path, path.with_name(f"{path.name}{image.suffix}")) for path in paths]
+        ends = [number for number, either in zip(numbers, files) if image in either]
         others = sorted({places[number] for number in numbers})
         if not ends and len(others) > 1:
-            raise InputError(
-                f"{image} would be the picture of {' and of '.join(others[:2])}: "
-                "give them names of their own"
-            )
+            both = f"{others[0]} and of {others[1]}"
+            raise InputError(f"{image} would be the picture of {both}: give each its own name")
         found.append(next(iter(ends or numbers), None))
     return found
 
@@ -236,12 +229,8 @@ methods learn without depths."""
 def unused_fields(meta: dict[str, Any]) -> list[str]:
     """Names of fields of a scene and of its frames that are not used and say something."""
     owners = [meta, *meta["frames"], *meta.get("test_frames", [])]
-    names = {
-        name
-        for owner in owners
-        for name, value in owner.items()
-        if value not in (None, False, 0, "", [], {})
-    }
+    nothing = (None, False, 0, "", [], {})
+    names = {name for owner in owners for name in owner if owner[name] not in nothing}
     return sorted(names - READ - NEEDLESS)
 
 
@@ -287,8 +276,7 @@ METHOD = "leco-occupancy"
 
 
 def command_with(reader: str, data: Path) -> str | None:
-    """The command that was typed, with a reader of this name and its options; None where the
-    command takes no reader."""
+    """The command that was typed, with a reader and its options; None where it takes no reader."""
     program, typed = Path(sys.argv[0]).name, sys.argv[1:]
     given = f"--data {shlex.quote(str(data))} {reader}"
     if program == "leco":
@@ -354,8 +342,7 @@ def _converter_for(data: Path) -> str | None:
 
 
 def remedy_for(data: Path) -> str | None:
-    """What to do about a folder that lacks the files of the reader it was given to; None where
-    nothing is known."""
+    """What to do about a folder that lacks its reader's files; None where nothing is known."""
     known = [(reader, folder) for folder in (data, data.parent) for reader in _readers_for(folder)]
     for reader, folder in known:
         if command := command_with(reader, folder):

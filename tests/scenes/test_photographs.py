@@ -21,9 +21,9 @@ from leco_plugin.scenes.frames import METRES_PER_UNIT, data_frame_of, inverse, m
 from leco_plugin.scenes.photographs import (
     POINTS,
     LecoPhotographsDataParserConfig,
-    check_scene,
     describe_scene,
     read_points,
+    read_scene,
     taken_from_above,
 )
 from leco_plugin.scenes.whole_files import write_points
@@ -142,8 +142,8 @@ def test_one_empty_mask_among_images_of_one_size_is_no_error(scene: Path) -> Non
 
 
 def test_a_sound_scene_passes_as_a_folder_and_as_a_file(scene: Path) -> None:
-    assert len(check_scene(scene)["frames"]) == 9
-    assert check_scene(scene / "transforms.json") == check_scene(scene)
+    assert len(read_scene(scene).meta["frames"]) == 9
+    assert read_scene(scene / "transforms.json").meta == read_scene(scene).meta
 
 
 IN_MILLIMETRES = (1e-3 * np.eye(3, 4)).tolist()
@@ -170,7 +170,7 @@ def test_sparse_points_follow_the_cameras_into_model_coordinates(
     scene: Path, process: Callable[[Path], None]
 ) -> None:
     """A point at each camera's position lies at that camera's position after parsing."""
-    meta = check_scene(scene)
+    meta = read_scene(scene).meta
     places = np.array([frame["transform_matrix"] for frame in meta["frames"]])[:, :3, 3]
     trimesh.PointCloud(places).export(scene / "points.ply")
     change(scene, lambda m: m.update(ply_file_path="points.ply"))
@@ -196,7 +196,7 @@ def test_a_held_out_stretch_leaves_the_way_back_to_the_file_as_it_is(scene: Path
     frame = data_frame_of(SimpleNamespace(train_dataparser_outputs=outputs))
     back = inverse(torch.tensor(frame, dtype=torch.float64))
     found = moved(outputs.cameras.camera_to_worlds[:, :, 3].double(), back).numpy()
-    frames = check_scene(scene)["frames"]
+    frames = read_scene(scene).meta["frames"]
     places = {Path(one["file_path"]).name: one["transform_matrix"] for one in frames}
     for path, place in zip(outputs.image_filenames, found):
         np.testing.assert_allclose(place, np.array(places[path.name])[:3, 3], atol=1e-4)

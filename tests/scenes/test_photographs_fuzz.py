@@ -15,7 +15,7 @@ from damaged_bytes import cut, flip, splice
 from scene_files import read_ply
 
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.photographs import check_scene
+from leco_plugin.scenes.photographs import read_scene
 
 SECONDS = 2.0
 
@@ -40,7 +40,7 @@ def test_flipped_cut_and_spliced_descriptions(scene: Path) -> None:
     path, random = scene / "transforms.json", np.random.default_rng(1)
     data = path.read_bytes()
     taken = sum(
-        read(path, (flip, cut, splice)[number % 3](data, random), check_scene)
+        read(path, (flip, cut, splice)[number % 3](data, random), read_scene)
         for number in range(450)
     )
     assert taken < 150
@@ -54,13 +54,13 @@ def test_values_of_other_types_anywhere_in_a_description(scene: Path) -> None:
     good = json.loads(path.read_text())
     for value in STRANGE:
         for name in good:
-            read(path, json.dumps(good | {name: value}).encode(), check_scene)
+            read(path, json.dumps(good | {name: value}).encode(), read_scene)
         for name in ("file_path", "transform_matrix", "mask_path", "w", "fl_x"):
             frames = [good["frames"][0] | {name: value}, *good["frames"][1:]]
             left = {key: part for key, part in good.items() if key != name}
-            read(path, json.dumps(left | {"frames": frames}).encode(), check_scene)
-        read(path, json.dumps(value).encode(), check_scene)
-    assert not read(path, b"[" * 100_000, check_scene)
+            read(path, json.dumps(left | {"frames": frames}).encode(), read_scene)
+        read(path, json.dumps(value).encode(), read_scene)
+    assert not read(path, b"[" * 100_000, read_scene)
 
 
 def ply(binary: bool) -> bytes:

@@ -12,7 +12,7 @@ from PIL import Image
 
 from leco_plugin.scenes.city.cameras import Lens, look_at
 from leco_plugin.scenes.frames import distance_from_rotations
-from leco_plugin.scenes.photographs import check_scene, read_points
+from leco_plugin.scenes.photographs import read_points, read_scene
 from leco_plugin.stability.photographs import (
     STAGES,
     TRUTH,
@@ -153,7 +153,7 @@ SMALL = Capture(views=4, test_views=2, width=16, height=12)
 
 def test_nerfstudio_can_read_it_and_the_truth_lies_beside(tmp_path: Path) -> None:
     folder = write_scene(STAGES["poles-and-wires"], SMALL, tmp_path / "scene")
-    meta = check_scene(folder)
+    meta = read_scene(folder).meta
     assert len(meta["train_filenames"]) == 4 and len(meta["test_filenames"]) == 2
     for name in meta["test_filenames"]:
         truth = np.load(folder / TRUTH / f"{Path(name).stem}.npz")
@@ -169,21 +169,21 @@ def test_sparse_points_lie_on_surfaces_where_the_written_poses_put_them(tmp_path
     cube = Stage((Box((-1.0, -1.0, 0.0), (1.0, 1.0, 2.0), Paint((0.5, 0.5, 0.5))),))
     far = Capture(views=4, test_views=2, width=16, height=12, origin=(100.0, 0.0, 0.0))
     folder = write_scene(cube, far, tmp_path / "scene")
-    points = read_points(check_scene(folder), folder)
+    points = read_points(read_scene(folder).meta, folder)
     assert points is not None
-    offsets = (points.numpy() - [100.0, 0.0, 1.0]) / 1.0
-    assert np.abs(offsets).max(axis=1) == pytest.approx(np.ones(len(points)), abs=1e-3)
+    offsets = (points.positions - [100.0, 0.0, 1.0]) / 1.0
+    assert np.abs(offsets).max(axis=1) == pytest.approx(np.ones(len(points.positions)), abs=1e-3)
 
 
 def test_a_scene_without_surfaces_has_no_points(tmp_path: Path) -> None:
     folder = write_scene(STAGES["all-empty"], SMALL, tmp_path / "scene")
-    assert "ply_file_path" not in check_scene(folder)
+    assert "ply_file_path" not in read_scene(folder).meta
 
 
 def test_pictures_of_three_sizes_fit_their_intrinsics(tmp_path: Path) -> None:
     mixed = Capture(views=6, test_views=2, width=16, height=12, sizes=(1.0, 0.5, 1.5))
     folder = write_scene(YARD, mixed, tmp_path / "scene")
-    frames = check_scene(folder)["frames"]
+    frames = read_scene(folder).meta["frames"]
     assert {(frame["w"], frame["h"]) for frame in frames} == {(16, 12), (8, 6), (24, 18)}
     assert {frame["fl_x"] / frame["w"] for frame in frames} == {frames[0]["fl_x"] / frames[0]["w"]}
 
@@ -192,7 +192,7 @@ def test_exposure_changes_the_light_and_not_the_shape(tmp_path: Path) -> None:
     plain = write_scene(YARD, SMALL, tmp_path / "plain")
     exposed = Capture(views=4, test_views=2, width=16, height=12, exposure=0.5)
     other = write_scene(YARD, exposed, tmp_path / "other")
-    for name in check_scene(plain)["train_filenames"]:
+    for name in read_scene(plain).meta["train_filenames"]:
         one, two = (np.asarray(Image.open(folder / name)) for folder in (plain, other))
         assert np.array_equal(one[..., 3], two[..., 3]) and not np.array_equal(one, two)
 

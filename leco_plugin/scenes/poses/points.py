@@ -1,8 +1,5 @@
-"""`leco points`: sparse points for a scene that has poses and no points.
-
-The poses and lenses stay as the scene gives them. Features are matched between photographs, and
-triangulated from those poses.
-"""
+"""`leco points`: sparse points for a scene that has poses and no points. Features are matched
+between photographs, and triangulated from the poses and lenses that the scene gives."""
 
 from __future__ import annotations
 
@@ -21,16 +18,9 @@ from leco_plugin.evaluation.report import usable_cores
 from leco_plugin.log import bar
 from leco_plugin.scenes.bounds import FEWEST_POINTS
 from leco_plugin.scenes.input_error import InputError, require
-from leco_plugin.scenes.lenses import DISTORTIONS, Lens
-from leco_plugin.scenes.photograph_files import (
-    check_images,
-    decode,
-    find_file,
-    header_of,
-    is_turned,
-    seen_pixels,
-)
-from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig, folder_of, read_points
+from leco_plugin.scenes.lenses import DISTORTIONS, MIXED, Lens
+from leco_plugin.scenes.photograph_files import decode, find_file, header_of, is_turned, seen_pixels
+from leco_plugin.scenes.photographs import read_points, read_scene
 from leco_plugin.scenes.poses.georeference import points_of, write_sparse_points
 from leco_plugin.scenes.poses.originals import FEWEST, Exif, Photograph
 from leco_plugin.scenes.poses.reconstruction import (
@@ -40,7 +30,7 @@ from leco_plugin.scenes.poses.reconstruction import (
     load_pycolmap,
     require_disk,
 )
-from leco_plugin.scenes.scene_file import SceneFile, scene_file_of
+from leco_plugin.scenes.scene_file import SceneFile
 from leco_plugin.scenes.whole_files import check_place, write_json, write_whole
 
 Array = NDArray[np.float64]
@@ -59,21 +49,18 @@ def find_points(data: Path, size: int = 1600, threads: int = 0) -> dict[str, Any
     """Gives a scene (folder, or json file) sparse points, unless it has some; returns `points`,
     `photographs`, `file` and `done`: False for a scene that had points.
 
-    Test photographs are left out where the scene lists those for training. Features are looked for
-    at a longest side of `size` pixels; 0 threads are all. InputError if the scene cannot be read,
-    or no points are found; ImportError without pycolmap.
+    Features are looked for at a longest side of `size` pixels; 0 threads are all. InputError if the
+    scene cannot be read, or no points are found; ImportError without pycolmap.
     """
     require(size >= 100, "size", size, "100 pixels or more")
     require(threads >= 0, "threads", threads, "0 for all, or a number of them")
-    scene = scene_file_of(LecoPhotographsDataParserConfig(data=data), "train")
-    assert scene is not None
-    check_images(scene.pictures())
+    scene = read_scene(data)
     chosen = training_frames(scene)
     report: dict[str, Any] = {"format": 1, "photographs": len(chosen)}
-    known = read_points(scene.meta, folder_of(data))
-    if known is not None and len(known) >= FEWEST_POINTS:
+    known = read_points(scene.meta, scene.folder)
+    if known is not None and len(known.positions) >= FEWEST_POINTS:
         file = str(scene.folder / scene.meta["ply_file_path"])
-        return report | {"points": len(known), "file": file, "done": False}
+        return report | {"points": len(known.positions), "file": file, "done": False}
     if len(chosen) < FEWEST:
         raise InputError(f"{scene.path} has {len(chosen)} photographs; {FEWEST} or more are needed")
     load_pycolmap()
@@ -90,26 +77,23 @@ def find_points(data: Path, size: int = 1600, threads: int = 0) -> dict[str, Any
         model = _triangulate(reconstructor, cameras, poses)
         _refuse_few(model, matched_features(reconstructor), scene.path)
     places, colours = points_of(model)
-    write_sparse_points(scene.path.with_name(FILE), places + centre, colours)
+    file = scene.path.with_name(FILE)
+    write_sparse_points(file, places + centre, colours)
     _name_points(scene.path)
-    file = str(scene.path.with_name(FILE))
-    return report | {"points": len(places), "file": file, "done": True}
+    return report | {"points": len(places), "file": str(file), "done": True}
 
 
 def training_frames(scene: SceneFile) -> list[int]:
     """Numbers of the frames that a scene trains on: all where it does not say."""
     listed = scene.meta.get("train_filenames")
-    every = range(len(scene.meta["frames"]))  # ScanNet++ lists its test frames after these
-    if not listed:
-        return list(every)
-    wanted = {find_file(scene.folder / str(name)) for name in listed}
-    pictures = scene.pictures()
-    return [number for number in every if pictures[number] in wanted]
+    pictures = scene.pictures()[: len(scene.meta["frames"])]  # ScanNet++ lists its tests after them
+    wanted = {find_file(scene.folder / str(name)) for name in listed} if listed else {*pictures}
+    return [number for number, picture in enumerate(pictures) if picture in wanted]
 
 
 def _triangulate(reconstructor: Reconstructor, cameras: Sequence[Any], poses: Array) -> Any:
-    """A model of pycolmap with points, in the coordinates of given OpenGL poses [C, 3, 4] with
-    cameras [C], of a reconstructor that has found features."""
+    """A model of pycolmap with points, from features and given OpenGL poses [C, 3, 4] with cameras
+    [C]."""
     pycolmap, work = reconstructor.pycolmap, reconstructor.folder / "triangulated"
     given = pycolmap.Reconstruction()
     with pycolmap.Database.open(reconstructor.database) as database:
@@ -125,14 +109,14 @@ def _triangulate(reconstructor: Reconstructor, cameras: Sequence[Any], poses: Ar
     reconstructor.match(choose_posed_pairs(poses))
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = reconstructor.threads, 0
-    triangulation = options.triangulation
-    longest = max(max(each.size) for each in reconstructor.photographs)
+    mapper, triangulation = options.mapper, options.triangulation
     # nine photographs have few points that three of them show
     triangulation.ignore_two_view_tracks = False
     # poses are off by an angle: that is more pixels of a larger picture
-    tolerance = max(options.mapper.filter_max_reproj_error, TOLERANCE * longest)
-    options.mapper.filter_max_reproj_error = tolerance
-    triangulation.complete_max_reproj_error = triangulation.merge_max_reproj_error = tolerance
+    longest = max(max(each.size) for each in reconstructor.photographs)
+    tolerance = max(mapper.filter_max_reproj_error, TOLERANCE * longest)
+    mapper.filter_max_reproj_error = triangulation.complete_max_reproj_error = tolerance
+    triangulation.merge_max_reproj_error = tolerance
     work.mkdir()
     return pycolmap.triangulate_points(
         given, reconstructor.database, reconstructor.images, work, options=options
@@ -181,8 +165,7 @@ def _copies(
     their cameras. What masks and opacity hide goes to the folder MASKS beside."""
     masks = folder.with_name(MASKS)
     folder.mkdir()
-    photographs, cameras = [], []
-    pictures = scene.pictures()
+    photographs, cameras, pictures = [], [], scene.pictures()
     with bar("reading photographs") as show:
         for count, number in enumerate(chosen):
             path, lens = pictures[number], scene.lenses[number]
@@ -191,15 +174,15 @@ def _copies(
             with decode(path, is_turned(header, full)) as image:
                 copy, seen = image.convert("RGB"), _seen(scene, number, path, image)
             copy.thumbnail((size, size), Image.Resampling.LANCZOS)
-            name = f"{number:06d}.png"
-            copy.save(folder / name, compress_level=1)
+            file = folder / f"{number:06d}.png"
+            copy.save(file, compress_level=1)
             if seen is not None:
                 masks.mkdir(exist_ok=True)
-                seen.resize(copy.size, Image.Resampling.NEAREST).save(masks / f"{name}.png")
+                seen.resize(copy.size, Image.Resampling.NEAREST).save(masks / f"{file.name}.png")
             camera = camera_of(lens, full, copy.size, str(path))
             lens_name = str(sorted(camera.todict().items(), key=str))  # shared by equal ones
-            header = header_of(folder / name)
-            photographs.append(Photograph(folder / name, name, header, Exif(camera=lens_name)))
+            exif = Exif(camera=lens_name)
+            photographs.append(Photograph(file, file.name, header_of(file), exif))
             cameras.append(camera)
             show((count + 1) / len(chosen))
     return photographs, cameras
@@ -219,11 +202,9 @@ def _seen(scene: SceneFile, number: int, path: Path, image: Image.Image) -> Imag
 
 def camera_of(lens: Lens, full: tuple[int, int], size: tuple[int, int], where: str) -> Any:
     """A camera of pycolmap: a lens in pixels of its full size (width, height), scaled to the size
-    of a copy. InputError, with `where`, if it is neither perspective nor fisheye, or has no focal
-    length."""
-    kinds = {None, CameraType.PERSPECTIVE, CameraType.FISHEYE}
+    of a copy. InputError for other lenses than perspective and fisheye, or without focal length."""
     focal = lens.focal_lengths(*full, factor=1)
-    if lens.kind not in kinds or focal[0] is None or focal[1] is None:
+    if lens.kind not in (None, *MIXED) or focal[0] is None or focal[1] is None:
         raise InputError(
             f"{where}: leco points needs a perspective or fisheye lens with a focal length; give "
             "bounds.altitudes, or near and far, in place of points"
@@ -246,8 +227,8 @@ def camera_of(lens: Lens, full: tuple[int, int], size: tuple[int, int], where: s
 
 def _name_points(path: Path) -> None:
     """Has a transforms.json name the points; the file as it was stays beside it."""
-    before = path.read_bytes()
-    if not path.with_name(BEFORE).exists():
-        write_whole(path.with_name(BEFORE), lambda file: file.write(before))
+    before, kept = path.read_bytes(), path.with_name(BEFORE)
+    if not kept.exists():
+        write_whole(kept, lambda file: file.write(before))
     meta = json.loads(before.decode("utf-8-sig")) | {"ply_file_path": FILE}
     write_json(path, meta, indent=1, allow_nan=True)

@@ -136,4 +136,4 @@ def test_points_with_large_coordinates_keep_their_digits(sign: float, tmp_path: 
     write_sparse_points(tmp_path / "points.ply", places, np.zeros((2, 3), np.uint8))
     found = read_points({"ply_file_path": "points.ply"}, tmp_path)
     assert found is not None
-    np.testing.assert_allclose(found.numpy(), places, rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(found.positions, places, rtol=0.0, atol=1e-6)
