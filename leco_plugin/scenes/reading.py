@@ -1,8 +1,5 @@
-"""What all readers of scenes pass: their pictures, masks and lenses, and their errors.
-
-nerfstudio has some fifteen readers, and packages add more. Each checks something else, so that
-what is read wrongly is looked for in what they return.
-"""
+"""What all readers of scenes pass: their pictures, masks and lenses, and their errors. Each checks
+something else, so that what is read wrongly is looked for in what they return."""
 
 from __future__ import annotations
 
@@ -16,14 +13,11 @@ from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.dataparsers.base_dataparser import (
-    DataParser,
-    DataParserConfig,
-    DataparserOutputs,
-)
+from nerfstudio.data.dataparsers import base_dataparser
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
 from PIL import UnidentifiedImageError
 
-from leco_plugin.log import bar, say
+from leco_plugin.log import bar, say, say_all
 from leco_plugin.scenes.frames import check_poses
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.large_coordinates import near_bases
@@ -62,7 +56,7 @@ class CheckedReader(DataParser):
     """Stands before a reader among the bases of a class: its outputs are checked, and each of its
     errors is one line."""
 
-    def __init__(self, config: DataParserConfig) -> None:
+    def __init__(self, config: base_dataparser.DataParserConfig) -> None:
         super().__init__(config)
         self._first: dict[bool, tuple[Path, str]] = {}
         """The first picture with transparency and the first without, each with its split."""
@@ -90,9 +84,10 @@ class CheckedReader(DataParser):
                 f"{_reason(error)}; {_remedy(error, config)}"
             ) from error
         if len(self._first) == 2:
+            (clear, its_split), (solid, other) = self._first[True], self._first[False]
             raise InputError(
-                f"{self._first[True][0]} of the split {self._first[True][1]} has transparency, and "
-                f"{self._first[False][0]} of {self._first[False][1]} has none: {SAVE_ALIKE}"
+                f"{clear} of the split {its_split} has transparency, and {solid} of {other} has "
+                f"none: {SAVE_ALIKE}"
             )
         return outputs
 
@@ -107,8 +102,7 @@ def checked_class(kind: type[DataParser]) -> type[DataParser]:
 
 def read_checked(parser: Any) -> Any:
     """A reader like this one that is checked."""
-    of: Any = type(parser)
-    kind = checked_class(of)
+    kind = checked_class(type(parser))
     return parser if isinstance(parser, kind) else kind(parser.config)
 
 
@@ -117,9 +111,9 @@ def set_up_checked(config: Any, **options: Any) -> Any:
     return checked_class(own_target(config))(config, **options)
 
 
-def with_checks(config: DataParserConfig) -> DataParserConfig:
+def with_checks(config: Any) -> Any:
     """The config of a reader that will be checked in whatever data manager."""
-    return replace(config, _target=set_up_checked)  # type: ignore[arg-type]
+    return replace(config, _target=set_up_checked)
 
 
 def reader_name(config: Any) -> str:
@@ -140,8 +134,7 @@ def _reason(error: BaseException) -> str:
 
 
 def _remedy(error: BaseException, config: Any) -> str:
-    """What to do about an error of a reader; another reader only where this one's file is not
-    there."""
+    """What to do about an error of a reader: another one only where its file is not there."""
     data, name = Path(config.data), reader_name(config)
     if not data.exists():
         return "there is no such folder: put it, or a link, there, or give another with --data"
@@ -151,10 +144,8 @@ def _remedy(error: BaseException, config: Any) -> str:
         if name != "colmap":
             return "run it on a terminal once, and answer"
         reader = f"colmap --downscale-factor 1 --colmap-path {config.colmap_path}"
-        return (
-            "it would make smaller copies of photographs of more than 1600 pixels: "
-            f"`{command_with(reader, data) or reader}` takes them as they are"
-        )
+        command = f"`{command_with(reader, data) or reader}` takes them as they are"
+        return f"it would make smaller copies of photographs of more than 1600 pixels: {command}"
     if "list of filenames for split" in str(error):
         return "list photographs in val_filenames and test_filenames too, or remove train_filenames"
     if "camera model" in _reason(error).lower():
@@ -187,19 +178,15 @@ def _lacks_its_file(error: BaseException, config: Any) -> bool:
 def checked(
     outputs: DataparserOutputs, config: Any, split: str, scene: SceneFile | None
 ) -> DataparserOutputs:
-    """What a reader returned, with every picture, mask and lens such as the files, and the scene's
-    own one, say. InputError, in one line.
-
-    Pictures and masks that nerfstudio would read wrongly are converted into `leco-cache/pictures`
-    beside the data, or refused.
-    """
+    """What a reader returned, with every picture, mask and lens such as the files say. InputError
+    for what cannot be read rightly. Some pictures and masks are converted into
+    `leco-cache/pictures` beside the data."""
     outputs.metadata = dict(outputs.metadata)
     if not outputs.image_filenames:
         return outputs
     data, speak = Path(config.data), split == "train"
-    derived = DerivedImages(
-        (data if data.is_dir() else data.parent) / "leco-cache" / "pictures", UNWRITABLE
-    )
+    folder = data if data.is_dir() else data.parent
+    derived = DerivedImages(folder / "leco-cache" / "pictures", UNWRITABLE)
     images = [Path(path) for path in outputs.image_filenames]
     cameras, factors = outputs.cameras, [1] * len(images)
     if cameras.camera_to_worlds.shape != (len(images), 3, 4):
@@ -207,9 +194,8 @@ def checked(
             f"{data}: {reader_name(config)} makes no cameras of {len(images)} photographs of the "
             f"split {split}: hold out more by a lower --train-split-fraction"
         )
-    check_poses(
-        cameras.camera_to_worlds.numpy(), [f"{data}: the pose of {path}" for path in images]
-    )
+    names = [f"{data}: the pose of {path}" for path in images]
+    check_poses(cameras.camera_to_worlds.numpy(), names)
     headers = [header_of(path) for path in images]
     lenses: list[Lens | None] = [None] * len(images)
     if scene is not None:
@@ -219,8 +205,7 @@ def checked(
         masks = [None if n is None else scene.frames[n].get("mask_path") for n in numbers]
         unread = outputs.mask_filenames is None and not hasattr(config, "masks_dir")
         if unread and all(masks):
-            folder = scene.path.parent
-            outputs.mask_filenames = [folder / str(path).replace("\\", "/") for path in masks]
+            outputs.mask_filenames = [scene.mask(str(path)) for path in masks]
         if speak:
             say_unused(scene.meta, scene.path)
     made = torch.cat([cameras.width, cameras.height], dim=-1).expand(len(images), -1).tolist()
@@ -228,7 +213,9 @@ def checked(
     cameras.width, cameras.height = torch.tensor(sizes).to(cameras.width).split(1, dim=1)
     set_lenses(cameras, lenses, factors)
     _check_focal_lengths(cameras, images)
-    outputs.image_filenames = _plain_pictures(images, headers, sizes, derived, speak)
+    turns = [is_turned(header, size) for header, size in zip(headers, sizes)]
+    outputs.image_filenames, lines = _plain_pictures(images, headers, turns, derived)
+    say_all(lines if speak else ())
     if outputs.mask_filenames is not None:
         paths = [Path(path) for path in outputs.mask_filenames]
         outputs.mask_filenames = convert_masks(paths, images, sizes, derived, speak)
@@ -242,17 +229,15 @@ def _check_focal_lengths(cameras: Cameras, images: list[Path]) -> None:
     for name in ("fx", "fy"):
         for path, value in zip(images, getattr(cameras, name).flatten().tolist()):
             if not 0.0 < value < float("inf"):
-                raise InputError(
-                    f"the camera of {path} has {name} {value:g}, which no camera has: mend the "
-                    "intrinsics in the files of the scene"
-                )
+                fault = f"the camera of {path} has {name} {value:g}, which no camera has"
+                raise InputError(f"{fault}: mend the intrinsics in the files of the scene")
 
 
 def _size_of(
     path: Path, header: Header, lens: Lens | None, wanted: list[int], factor: int
 ) -> tuple[int, int]:
     """Width and height of a picture as it will be read. InputError unless they are those of its
-    lens or, where that is not known, those `wanted` for its camera."""
+    lens or, without one, those `wanted` for its camera."""
     slack = 1
     if lens is not None and lens.width is not None and lens.height is not None:
         wanted = [int(lens.width) // factor, int(lens.height) // factor]
@@ -269,15 +254,10 @@ def _size_of(
 
 
 def _plain_pictures(
-    images: list[Path],
-    headers: list[Header],
-    sizes: list[tuple[int, int]],
-    derived: DerivedImages,
-    speak: bool,
-) -> list[Path]:
-    """Files of the pictures that nerfstudio reads rightly."""
+    images: list[Path], headers: list[Header], turns: list[bool], derived: DerivedImages
+) -> tuple[list[Path], list[str]]:
+    """Files that nerfstudio reads rightly, some turned as EXIF says, and lines on what was done."""
     paths, converted, as_stored = [], Counter[str](), []
-    turns = [is_turned(header, size) for header, size in zip(headers, sizes)]
     needed = any(turns) or not all(is_plain(header) for header in headers)
     with bar("Converting photographs") if needed else nullcontext(lambda share: None) as progress:
         for path, header, turn in zip(images, headers, turns):
@@ -292,16 +272,14 @@ def _plain_pictures(
             progress(len(paths) / len(images))
     transparent = [path for path, header in zip(images, headers) if header.transparent]
     if 0 < len(transparent) < len(images):
-        raise InputError(
-            f"{len(transparent)} of {len(images)} images have transparency, the first is "
-            f"{transparent[0]}: {SAVE_ALIKE}"
-        )
-    for what, count in converted.items() if speak else ():
-        say(f"{count} photographs {what} are converted into {derived.folder}")
-    if as_stored and speak:
-        say(
+        some = f"{len(transparent)} of {len(images)} images have transparency"
+        raise InputError(f"{some}, the first is {transparent[0]}: {SAVE_ALIKE}")
+    into = f"are converted into {derived.folder}"
+    lines = [f"{count} photographs {what} {into}" for what, count in converted.items()]
+    if as_stored:
+        lines.append(
             f"{len(as_stored)} photographs are used as they are stored, though EXIF turns them: "
             f"that is what their intrinsics are for; the first is {as_stored[0]}. "
             "Where renders are turned, `mogrify -auto-orient` them and make the scene anew"
         )
-    return paths
+    return paths, lines

@@ -51,6 +51,10 @@ class SceneFile:
         """The file of each frame, where there is one."""
         return [find_file(self.folder / frame["file_path"]) for frame in self.frames]
 
+    def mask(self, name: str) -> Path:
+        """The file of a mask by its name, also as Windows writes it."""
+        return self.path.parent / name.replace("\\", "/")
+
 
 def file_in(data: Path) -> Path:
     """The transforms.json that `data` means: itself, or that in the folder."""

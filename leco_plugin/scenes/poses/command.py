@@ -16,19 +16,8 @@ from leco_plugin.log import bar, resumable
 from leco_plugin.scenes.input_error import InputError, require
 from leco_plugin.scenes.locks import LOCK, alone_in
 from leco_plugin.scenes.poses import ASKED
-from leco_plugin.scenes.poses.georeference import (
-    MODEL,
-    POINTS,
-    Placement,
-    local_places,
-    place,
-    points_of,
-    poses_of,
-    transforms_of,
-    upright,
-    write_scene,
-    write_sparse_points,
-)
+from leco_plugin.scenes.poses import georeference as world
+from leco_plugin.scenes.poses.georeference import MODEL, POINTS, Placement, points_of, poses_of
 from leco_plugin.scenes.poses.originals import Photograph, copy_photographs, find_photographs
 from leco_plugin.scenes.poses.reconstruction import (
     ENTERED,
@@ -61,11 +50,11 @@ NAMED = 5
 def make_scene(
     folder: Path, out: Path, lens: Lens = "perspective", size: int = 1600, threads: int = 0
 ) -> dict[str, Any]:
-    """Makes a scene of photographs, unless `out` already holds it; returns the report.
+    """Makes a scene of photographs, unless `out` already holds it; returns the report. Goes on with
+    what a killed run has left.
 
-    A killed run resumes when the same is asked for again. Features are looked for at a longest
-    side of `size` pixels; 0 threads are all of the CPU. InputError if `out` holds something else,
-    or the photographs cannot be used; ImportError without pycolmap.
+    Features are looked for at a longest side of `size` pixels; 0 threads are all. InputError if
+    `out` holds something else, or the photographs cannot be used; ImportError without pycolmap.
     """
     require(size >= 100, "size", size, "100 pixels or more")
     require(threads >= 0, "threads", threads, "0 for all, or a number of them")
@@ -84,11 +73,14 @@ def make_scene(
         for line in list(found.refused.values())[:NAMED]:
             print(f"left out: {line}")
         if (out / DESCRIPTION).exists():  # it was finished, and has lost files since
-            return _restored(pycolmap, out)
+            if not (out / POINTS).is_file():
+                points = points_of(pycolmap.Reconstruction(out / MODEL))
+                world.write_sparse_points(out / POINTS, *points)
+            return _read(out / REPORT) or {}
         photographs = found.photographs
         _require_disk(out, photographs)  # once more, as the size of copies was a guess
         exifs = [each.exif for each in photographs]
-        origin, places = local_places(pycolmap, [exif.position for exif in exifs])
+        origin, places = world.local_places(pycolmap, [exif.position for exif in exifs])
         chosen = choose_pairs([each.name for each in photographs], exifs, places)
         work = Reconstructor(out, photographs, threads or usable_cores())
         work.extract(lens, size)
@@ -106,35 +98,32 @@ def make_scene(
             "pairs_by": chosen.reason,
             "seconds": round(time.monotonic() - began, 1),
         }
-        write_scene(out, models[0], transforms_of(models[0], placement, origin), report, REPORT)
+        meta = world.transforms_of(models[0], placement, origin)
+        world.write_scene(out, models[0], meta, report, REPORT)
     return report
 
 
 def _asked(photographs: list[Photograph], lens: Lens, size: int) -> dict[str, Any]:
     """What is asked for: JSON values, those of photographs and of their GPS as digests."""
-    known = [each.content for each in photographs]
-    positions = [each.exif.position for each in photographs]
-    asked = {"format": FORMAT, "photographs": len(photographs), "digest": _digest(known)}
-    return {**asked, GPS: _digest(positions), "lens": lens, "size": size}
+    known = _digest([each.content for each in photographs])
+    positions = _digest([each.exif.position for each in photographs])
+    asked = {"format": FORMAT, "photographs": len(photographs), "digest": known}
+    return {**asked, GPS: positions, "lens": lens, "size": size}
 
 
 def _digest(value: Any) -> str:
     return hashlib.blake2b(json.dumps(value).encode(), digest_size=8).hexdigest()
 
 
-def _begun(out: Path, asked: dict[str, Any]) -> dict[str, Any] | None:
-    """What a scene was begun with; None where there is none. Its GPS is that of now where an
-    earlier version has not noted it."""
-    if not (out / ASKED).is_file():
-        return None
-    found: dict[str, Any] = {GPS: asked[GPS]} | json.loads((out / ASKED).read_text())
-    return found
+def _read(file: Path) -> dict[str, Any] | None:
+    """What a file of JSON says; None where there is none."""
+    return json.loads(file.read_text()) if file.is_file() else None
 
 
 def _finished(out: Path, asked: dict[str, Any]) -> dict[str, Any] | None:
     """The report of a scene that is finished; None of one that is to be made or to go on.
     InputError if the folder holds something else."""
-    found = _begun(out, asked)
+    found = _read(out / ASKED)
     if found is None:
         if out.exists() and (not out.is_dir() or {each.name for each in out.iterdir()} - {LOCK}):
             raise InputError(f"--out {out} holds something else: give another folder")
@@ -144,33 +133,16 @@ def _finished(out: Path, asked: dict[str, Any]) -> dict[str, Any] | None:
         what = " and ".join(sorted({"photographs" if n == "digest" else n for n in other}))
         why = "by another version" if "format" in other else f"with other {what}"
         raise InputError(f"--out {out} was begun {why}: give another folder, or delete it")
-    if found != asked or not all((out / name).is_file() for name in _files_of(out)):
+    if found != asked or not (out / DESCRIPTION).is_file() or not (out / POINTS).is_file():
         return None
-    report: dict[str, Any] = json.loads((out / REPORT).read_text())
-    return report
-
-
-def _files_of(out: Path) -> list[str]:
-    """The files of a finished scene, as far as it says which."""
-    if not (out / DESCRIPTION).is_file():
-        return [DESCRIPTION]
-    named = [frame["file_path"] for frame in load_json(out / DESCRIPTION)["frames"]]
-    return [*named, POINTS, REPORT]
-
-
-def _restored(pycolmap: Any, out: Path) -> dict[str, Any]:
-    """The report of a finished scene whose pictures are there again, with its points; what it says
-    in transforms.json, which may have been edited, stays."""
-    if not (out / POINTS).is_file():
-        write_sparse_points(out / POINTS, *points_of(pycolmap.Reconstruction(out / MODEL)))
-    report: dict[str, Any] = json.loads((out / REPORT).read_text())
-    return report
+    images = [out / frame["file_path"] for frame in load_json(out / DESCRIPTION)["frames"]]
+    return _read(out / REPORT) if all(image.is_file() for image in images) else None
 
 
 def _begin(out: Path, asked: dict[str, Any]) -> None:
     """Begins a scene or goes on with it. Where GPS was mended since, or nothing but copies were
     made of other photographs, what follows from them is made anew; features and matches stay."""
-    found = _begun(out, asked)
+    found = _read(out / ASKED)
     if found is not None and found != asked:
         if (out / ENTERED).exists():
             print("EXIF has other GPS than before: photographs are placed anew")
@@ -193,12 +165,11 @@ def _require_disk(out: Path, photographs: list[Photograph]) -> None:
 def _put_in_the_world(pycolmap: Any, model: Any, gps: dict[str, Any]) -> Placement:
     """Moves a model upright, and to metres where GPS allows it."""
     names, poses = poses_of(model)
-    up = upright(poses, points_of(model)[0])
+    up = world.upright(poses, points_of(model)[0])
     known, top = np.array([gps[name] for name in names]), poses[:, :, 1].mean(axis=0)
-    placement = place(pycolmap, poses[:, :, 3], known, up, top)
-    rotation = pycolmap.Rotation3d(placement.turn)
-    model.transform(pycolmap.Sim3d(placement.scale, rotation, placement.shift))
-    return placement
+    placed = world.place(pycolmap, poses[:, :, 3], known, up, top)
+    model.transform(pycolmap.Sim3d(placed.scale, pycolmap.Rotation3d(placed.turn), placed.shift))
+    return placed
 
 
 def _report(models: list[Any], sources: dict[str, str], placement: Placement) -> dict[str, Any]:
@@ -211,8 +182,8 @@ def _report(models: list[Any], sources: dict[str, str], placement: Placement) ->
         names = [sources[name] for name in poses_of(models[0])[0]]
         gps["contradicted"] = [name for name, off in zip(names, residuals) if off > WRONG]
         known = residuals[residuals <= WRONG]
-        gps |= {"photographs": len(known), "median_metres": round(float(np.median(known)), 3)}
-        gps |= {"most_metres": round(float(np.max(known)), 3)}
+        median, most = (round(float(part(known)), 3) for part in (np.median, np.max))
+        gps |= {"photographs": len(known), "median_metres": median, "most_metres": most}
     return {
         "format": 1,
         "photographs": len(sources),
@@ -237,10 +208,11 @@ def summary(report: dict[str, Any]) -> list[str]:
     if lost := report["not_placed"]:
         lines.append(f"not placed: {_some(lost)}")
     if blocks := report["other_blocks"]:
+        named = "; ".join(_some(block) for block in blocks[:NAMED])
         lines.append(
             f"{sum(map(len, blocks))} of these are placed among themselves, and share too little "
-            f"with the rest: {'; '.join(_some(block) for block in blocks[:NAMED])}; their models "
-            "stay in colmap/models, and leco poses on a block alone makes it a scene"
+            f"with the rest: {named}; their models stay in colmap/models, and leco poses on a "
+            "block alone makes it a scene"
         )
     if placed <= FEW_PLACED * count:
         lines.append("more overlap between neighbours places more photographs")
@@ -250,13 +222,11 @@ def summary(report: dict[str, Any]) -> list[str]:
             f"in metres by the GPS of {gps['photographs']} photographs: they are off by "
             f"{gps['median_metres']:.2f} m (median) and {gps['most_metres']:.2f} m at most"
         )
-        if not report.get("altitudes", True):
+        if not report["altitudes"]:
             lines.append("EXIF gives no altitude: heights count from the cameras, not the sea")
-        if wrong := gps.get("contradicted"):
-            lines.append(
-                f"GPS contradicts the poses by more than {WRONG:.0f} m, and is not used, of "
-                f"{_some(wrong)}"
-            )
+        if wrong := gps["contradicted"]:
+            much = f"GPS contradicts the poses by more than {WRONG:.0f} m"
+            lines.append(f"{much}, and is not used, of {_some(wrong)}")
     else:
         lines.append(f"no metres: {gps['reason']}")
     return lines

@@ -1,12 +1,10 @@
-"""What becomes of a reconstruction: set upright, in metres where GPS is known, and a scene on disk.
-
-A placed model is written as transforms.json, sparse points and COLMAP's own files.
-"""
+"""What becomes of a reconstruction: set upright, in metres where GPS is known, and a scene on disk:
+transforms.json, sparse points and COLMAP's own files."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from leco_plugin.scenes.frames import turn_to_upright
+from leco_plugin.scenes.poses.originals import Position
 from leco_plugin.scenes.whole_files import write_json, write_points
 
 Array = NDArray[np.float64]
@@ -31,10 +30,6 @@ AGREEING, ALWAYS = 0.5, 3
 """Share of positions that must agree with the poses, beside those few that always can."""
 WANDERING = 0.3
 """Length of the mean of the cameras' top axes below which they do not say what is up."""
-
-
-Position = tuple[float, float, float]
-"""Latitude and longitude in degrees, altitude in metres."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +54,8 @@ class Placement:
 def local_places(
     pycolmap: Any, positions: Sequence[Position | None]
 ) -> tuple[Position | None, Array]:
-    """Positions in metres east, north and up [N, 3] of an origin at sea level, their median; nan
-    and None where nothing is known. A nan altitude is the median of the others, or 0."""
+    """An origin at sea level, the median of positions, and these in metres east, north and up of
+    it [N, 3]; None and nan where nothing is known. A nan altitude is the median of others, or 0."""
     places = np.array([each or (np.nan,) * 3 for each in positions], dtype=float).reshape(-1, 3)
     there = np.isfinite(places[:, 0])
     if not there.any():
@@ -76,12 +71,9 @@ def local_places(
 
 
 def upright(poses: Array, points: Array) -> Array:
-    """The direction [3] that is up in a reconstruction of poses [C, 3, 4], OpenGL's, and points [P,
-    3].
-
-    Of surveys from the air it is seen from ground and cameras. Of others it is the mean of the
-    photographs' top edges, or against the mean view where these point in all directions.
-    """
+    """The direction [3] that is up in a reconstruction of OpenGL poses [C, 3, 4] and points [P, 3]:
+    for others than surveys from the air the mean of the photographs' top edges, or against the mean
+    view where these point in all directions."""
     # a survey that lies within 20 degrees of upright is not turned: laid down, it is
     for base in (np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.eye(3)):
         turn = turn_to_upright(torch.from_numpy(base @ poses), torch.from_numpy(points @ base.T))
@@ -97,53 +89,44 @@ def place(
 ) -> Placement:
     """The similarity that takes a reconstruction to metres, or a rotation that sets it upright.
 
-    Of camera centres [C, 3] with positions by GPS [C, 3] in metres, nan where not known; a flight
-    along one line also needs what is up [3] in the reconstruction. The mean `top` [3] of the
-    photographs' top edges, if given, has a word where GPS would turn that upside down.
+    Of camera centres [C, 3] with positions by GPS [C, 3] in metres, nan where not known, and what
+    is up [3]. The mean `top` [3] of the photographs' top edges has a word where GPS would turn that
+    upside down.
     """
-    known = np.isfinite(gps).all(axis=1)
-    if known.sum() < FEWEST:
-        number = int(known.sum()) or "no"
-        return _by_direction(
-            up, f"{number} placed photographs have a GPS position, and {FEWEST} are needed"
-        )
-    spread = float(np.sqrt(((gps[known] - gps[known].mean(axis=0)) ** 2).sum(axis=1).mean()))
+    there = np.isfinite(gps).all(axis=1)
+    known, count = gps[there], int(there.sum())
+    if count < FEWEST:
+        few = f"{count or 'no'} placed photographs have a GPS position"
+        return _by_direction(up, f"{few}, and {FEWEST} are needed")
+    spread = float(np.sqrt(((known - known.mean(axis=0)) ** 2).sum(axis=1).mean()))
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed = tolerance(spread), 0
     found: Any = None
     if options.max_error > 0.0:  # else all positions are the same
-        found = pycolmap.estimate_sim3d_robust(centres[known], gps[known], options)
+        found = pycolmap.estimate_sim3d_robust(centres[there], known, options)
     agreeing = 0 if found is None else int(np.sum(found["inlier_mask"]))
-    if agreeing - ALWAYS < AGREEING * (known.sum() - ALWAYS):
-        reason = (
-            f"GPS contradicts the poses: {agreeing} of {known.sum()} positions agree within "
-            f"{options.max_error:.1f} m; mend EXIF, or set metres_per_unit in transforms.json"
-        )
+    if agreeing - ALWAYS < AGREEING * (count - ALWAYS):
+        within = f"{agreeing} of {count} positions agree within {options.max_error:.1f} m"
+        reason = f"GPS contradicts the poses: {within}; mend EXIF, or"
         if spread < TOLERANCE:
-            reason = (
-                f"the positions by GPS lie {spread:.1f} m apart, too near for what GPS is off by; "
-                "set metres_per_unit in transforms.json"
-            )
-        return _by_direction(up, reason)
+            near = f"the positions by GPS lie {spread:.1f} m apart"
+            reason = f"{near}, too near for what GPS is off by;"
+        return _by_direction(up, f"{reason} set metres_per_unit in transforms.json")
     matrix, inlier = found["tgt_from_src"].matrix(), np.asarray(found["inlier_mask"], dtype=bool)
-    scale = float(np.linalg.det(matrix[:, :3])) ** (1.0 / 3.0)
-    turn = roll_upright(matrix[:, :3] / scale, gps[known][inlier], up, options.max_error)
-    if _is_mirrored(turn, gps[known][inlier], up, top, options.max_error):
-        return _by_direction(
-            up,
-            "GPS fits the poses only upside down: mend the references to north or south, east or "
-            "west in EXIF, where they are wrong",
-        )
-    middles = gps[known][inlier].mean(axis=0), centres[known][inlier].mean(axis=0)
-    placed = Placement(scale, turn, middles[0] - scale * turn @ middles[1])
-    residuals = np.linalg.norm(placed.apply(centres) - gps, axis=1)
-    return Placement(scale, turn, placed.shift, residuals)
+    scale, places = float(np.linalg.det(matrix[:, :3])) ** (1.0 / 3.0), known[inlier]
+    turn = roll_upright(matrix[:, :3] / scale, places, up, options.max_error)
+    if _is_mirrored(turn, places, up, top, options.max_error):
+        mend = "mend the references to north or south, east or west in EXIF, where they are wrong"
+        return _by_direction(up, f"GPS fits the poses only upside down: {mend}")
+    shift = places.mean(axis=0) - scale * turn @ centres[there][inlier].mean(axis=0)
+    placed = Placement(scale, turn, shift)
+    return replace(placed, residuals=np.linalg.norm(placed.apply(centres) - gps, axis=1))
 
 
 def _is_mirrored(turn: Array, places: Array, up: Array, top: Array | None, width: float) -> bool:
     """Whether a turn [3, 3] to places [N, 3] by GPS, about `width` metres off, puts what is up [3]
-    down. Places in a plane fit as well from below; others, on a line or solid, say nothing of it,
-    and tops [3] that point up afterwards tell of cameras that look up."""
+    down: places in a plane fit as well from below. Tops [3] that point up afterwards tell of
+    cameras that look up."""
     away = places - places.mean(axis=0)
     spread = np.linalg.svd(away, compute_uv=False) / np.sqrt(len(places))
     lies_in_a_plane = spread[1] > width > spread[2]
@@ -159,10 +142,8 @@ def tolerance(spread: float) -> float:
 def roll_upright(turn: Array, places: Array, up: Array, width: float) -> Array:
     """A rotation [3, 3], rolled about the line of flight so that `up` goes up: places [N, 3] on a
     line say nothing of that roll. It stays for places wider than `width` metres across."""
-    away = places - places.mean(axis=0)
-    _, lengths, axes = np.linalg.svd(away, full_matrices=False)
-    across = lengths[1] / np.sqrt(len(places))
-    if across > width:
+    _, lengths, axes = np.linalg.svd(places - places.mean(axis=0), full_matrices=False)
+    if lengths[1] / np.sqrt(len(places)) > width:
         return turn
     line = axes[0]
     wanted, is_up = (each - (each @ line) * line for each in (np.array([0, 0, 1.0]), turn @ up))
@@ -209,11 +190,9 @@ def points_of(model: Any) -> tuple[Array, NDArray[np.uint8]]:
     return places, np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
 
 
-def transforms_of(
-    model: Any, placement: Placement, origin: tuple[float, float, float] | None
-) -> dict[str, Any]:
-    """What transforms.json says of a model that a placement has put into the world, whose origin
-    has this latitude, longitude and altitude if coordinates are metres."""
+def transforms_of(model: Any, placement: Placement, origin: Position | None) -> dict[str, Any]:
+    """What transforms.json says of a model that a placement has put into the world, with the place
+    of its origin if coordinates are metres."""
     lenses = {number: intrinsics(camera) for number, camera in model.cameras.items()}
     names, poses = poses_of(model)
     used = [model.find_image_with_name(name).camera_id for name in names]

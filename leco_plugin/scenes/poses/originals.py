@@ -1,8 +1,5 @@
-"""The photographs of a folder: what EXIF says, checks before long work, copies for the scene.
-
-A copy has 8 bits a channel, is JPEG or PNG, and stands upright as EXIF says. The originals are
-only read.
-"""
+"""The photographs of a folder, which are only read: what EXIF says, checks before long work, and
+copies for the scene, JPEG or PNG with 8 bits a channel, upright as EXIF says."""
 
 from __future__ import annotations
 
@@ -27,9 +24,10 @@ from leco_plugin.scenes.photograph_files import Header, check_kind, decode, head
 from leco_plugin.scenes.whole_files import write_whole
 
 T = TypeVar("T")
-INCH, CENTIMETRE = 25.4, 10.0
-UNITS = {2: INCH, 3: CENTIMETRE, 4: 1.0}
-"""EXIF's FocalPlaneResolutionUnit, in millimetres."""
+Position = tuple[float, float, float]
+"""Latitude and longitude in degrees, altitude in metres, which may be nan."""
+UNITS = {2: 25.4, 3: 10.0, 4: 1.0}
+"""EXIF's FocalPlaneResolutionUnit, inch, centimetre or millimetre, in millimetres."""
 FILM_DIAGONAL = math.hypot(36.0, 24.0)
 """Of the 35 mm film, in millimetres, to which equivalent focal lengths refer."""
 FOCAL_RANGE = (0.2, 20.0)
@@ -39,8 +37,7 @@ FOCAL_RANGE = (0.2, 20.0)
 class Exif(NamedTuple):
     """What is known of a photograph; None where EXIF does not say it."""
 
-    position: tuple[float, float, float] | None = None
-    """Latitude and longitude in degrees, altitude in metres. The altitude may be nan."""
+    position: Position | None = None
     time: float | None = None
     """Seconds, of the camera's clock."""
     camera: str = ""
@@ -63,26 +60,25 @@ def read_exif(image: Image.Image) -> Exif:
 
 
 def focal_length(details: Mapping[int, Any], size: tuple[int, int]) -> float | None:
-    """Focal length over the longest side of a picture of a width and height, by EXIF's own tags;
-    the 35 mm equivalent goes before the sensor's resolution, which is that of the picture as taken,
-    not of one made smaller."""
-    diagonal = math.hypot(*size) / max(size)
-    equivalent = _number(details.get(ExifTags.Base.FocalLengthIn35mmFilm))
-    found = diagonal * equivalent / FILM_DIAGONAL
+    """Focal length over the longest side of a picture of a width and height. The 35 mm equivalent
+    goes before the sensor's resolution, which is that of the picture as taken."""
+
+    def said(tag: ExifTags.Base) -> float:
+        return _number(details.get(tag))
+
+    equivalent = said(ExifTags.Base.FocalLengthIn35mmFilm)
+    found = math.hypot(*size) / max(size) * equivalent / FILM_DIAGONAL
     if not FOCAL_RANGE[0] < found < FOCAL_RANGE[1]:
-        resolution = _number(details.get(ExifTags.Base.FocalPlaneXResolution))
-        unit = UNITS.get(int(_number(details.get(ExifTags.Base.FocalPlaneResolutionUnit)) or 2))
-        taken = max(
-            _number(details.get(ExifTags.Base.ExifImageWidth)),
-            _number(details.get(ExifTags.Base.ExifImageHeight)),
-        )
+        unit = UNITS.get(int(said(ExifTags.Base.FocalPlaneResolutionUnit) or 2))
+        taken = max(said(ExifTags.Base.ExifImageWidth), said(ExifTags.Base.ExifImageHeight))
         if unit is None or taken <= 0.0:
             return None
-        found = _number(details.get(ExifTags.Base.FocalLength)) * resolution / unit / taken
+        resolution = said(ExifTags.Base.FocalPlaneXResolution)
+        found = said(ExifTags.Base.FocalLength) * resolution / unit / taken
     return found if FOCAL_RANGE[0] < found < FOCAL_RANGE[1] else None
 
 
-def _position(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
+def _position(gps: Mapping[int, Any]) -> Position | None:
     """Position; None where it is not said, or is the 0, 0 of a receiver without satellites."""
     latitude = _degrees(gps.get(ExifTags.GPS.GPSLatitude), gps.get(ExifTags.GPS.GPSLatitudeRef))
     longitude = _degrees(gps.get(ExifTags.GPS.GPSLongitude), gps.get(ExifTags.GPS.GPSLongitudeRef))
@@ -106,9 +102,8 @@ def _degrees(parts: Any, reference: Any) -> float:
 
 def _time(details: Mapping[int, Any]) -> float | None:
     try:
-        taken = datetime.strptime(
-            str(details[ExifTags.Base.DateTimeOriginal])[:19], "%Y:%m:%d %H:%M:%S"
-        )
+        said = str(details[ExifTags.Base.DateTimeOriginal])[:19]
+        taken = datetime.strptime(said, "%Y:%m:%d %H:%M:%S")
         fraction = str(details.get(ExifTags.Base.SubsecTimeOriginal, "")).strip("\0 ")
         part = float(f"0.{fraction}") if fraction.isdecimal() else 0.0
         return (taken - datetime(1970, 1, 1)).total_seconds() + part
@@ -161,8 +156,8 @@ class Photograph:
 
     @property
     def content(self) -> tuple[object, ...]:
-        """What tells whether it is the same picture: name, bytes without EXIF, and what of EXIF its
-        copy and its lens depend on."""
+        """What tells whether it is the same picture: name, bytes without EXIF, and of EXIF what its
+        copy and lens depend on."""
         length = self.path.stat().st_size - described_bytes(self.path)
         return self.name, length, self.size, self.header.orientation, self.exif[2:]
 
@@ -214,10 +209,11 @@ def find_photographs(folder: Path, out: Path) -> Found:
     if len(found) < FEWEST:
         number = f"{len(found) or 'no'} photograph{'' if len(found) == 1 else 's'}"
         raw = sum(path.suffix.lower() in RAW for path in files)
+        films = sum(path.suffix.lower() in FILMS for path in files)
         remedy = "take more, from different places, whose pictures overlap by two thirds"
         if raw:
             remedy = f"{raw} raw files are not read, save them as JPEG"
-        elif films := sum(path.suffix.lower() in FILMS for path in files):
+        elif films:
             remedy = f"{films} videos are not read: take pictures out of them, two a second, as by "
             remedy += "ffmpeg -i FILM -vf fps=2 PHOTOS/%05d.jpg"
         elif not found:
@@ -228,7 +224,10 @@ def find_photographs(folder: Path, out: Path) -> Found:
         import_module("pillow_heif").register_heif_opener()
     refused: dict[Path, str] = {}
     photographs = [each for path in found if (each := _or_why(_read, path, folder, refused))]
-    _refuse_mixed_alpha(photographs)
+    clear = [each.path for each in photographs if each.header.transparent]
+    if clear and len(clear) < len(photographs):
+        some = f"{len(clear)} of {len(photographs)} photographs have an alpha channel"
+        raise InputError(f"{some}, the first is {clear[0]}: give it to all of them or to none")
     if len({photograph.name.lower() for photograph in photographs}) < len(photographs):
         digits = len(str(len(photographs)))
         photographs = [
@@ -239,8 +238,8 @@ def find_photographs(folder: Path, out: Path) -> Found:
 
 
 def _files_below(folder: Path, out: Path) -> list[Path]:
-    """Files in a folder and below it, by name, each folder once; what is hidden or lies in `out` is
-    left out."""
+    """Files in a folder and below it, by name, each folder once, but for what is hidden or lies in
+    `out`."""
     found: list[Path] = []
     known = set()
     starts = [folder]  # linked folders follow, so that a folder is known by its own name first
@@ -260,9 +259,9 @@ def _files_below(folder: Path, out: Path) -> list[Path]:
 
 def _enough(found: Found) -> Found:
     """What was found. InputError if too much of it cannot be used."""
-    used, refused = len(found.photographs), len(found.refused)
+    used, files = len(found.photographs), len(found.photographs) + len(found.refused)
     if used < FEWEST:
-        left = f"{used} of {used + refused} photographs can be used, and {FEWEST} are needed"
+        left = f"{used} of {files} photographs can be used, and {FEWEST} are needed"
         raise InputError(f"{next(iter(found.refused.values()))} ({left})")
     return found
 
@@ -305,20 +304,10 @@ def _header(path: Path) -> Header:
     raise InputError(f"{path} is HEIC: `pip install pillow-heif` reads it, or save it as JPEG")
 
 
-def _refuse_mixed_alpha(photographs: list[Photograph]) -> None:
-    """InputError if some photographs have an opacity and others have none."""
-    clear = [each for each in photographs if each.header.transparent]
-    if clear and len(clear) < len(photographs):
-        raise InputError(
-            f"{len(clear)} of {len(photographs)} photographs have an alpha channel, the first is "
-            f"{clear[0].path}: give it to all of them or to none"
-        )
-
-
 def copy_photographs(found: Found, folder: Path, show: Callable[[float], None]) -> Found:
-    """Writes those copies that are not there yet; `show` takes the share that is done. Returns what
-    was found without the photographs whose pixels cannot be decoded. InputError if fewer than three
-    are left, or a copy cannot be written."""
+    """Writes copies that are not there yet; `show` takes the share done. Returns what was found
+    without what cannot be decoded. InputError if fewer than three are left, or a copy cannot be
+    written."""
     photographs, refused = [], dict(found.refused)
     for number, photograph in enumerate(found.photographs):
         copy = folder / photograph.name
@@ -346,8 +335,8 @@ def _write(photograph: Photograph, image: Image.Image, path: Path) -> None:
 
 
 def _upright_exif(image: Image.Image, kind: str) -> bytes:
-    """EXIF of an image that has been turned upright. Where it cannot be written, or is too long for
-    a JPEG, it says nothing but that the image is upright."""
+    """EXIF of an image that has been turned upright: only that where the rest cannot be written, or
+    is too long for a JPEG."""
     upright = Image.Exif()
     upright[ExifTags.Base.Orientation] = 1
     try:

@@ -191,8 +191,7 @@ def _copies(
 def _seen(scene: SceneFile, number: int, path: Path, image: Image.Image) -> Image.Image | None:
     """White where a photograph is seen, by its mask or its opacity; None where all of it is."""
     if mask := scene.frames[number].get("mask_path"):
-        place = scene.path.parent / str(mask).replace("\\", "/")
-        shown = seen_pixels(place, path, image.size)
+        shown = seen_pixels(scene.mask(str(mask)), path, image.size)
     elif header_of(path).transparent:
         shown = np.asarray(image.convert("RGBA"))[..., 3] > 0
     else:

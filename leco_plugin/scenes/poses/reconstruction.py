@@ -1,8 +1,7 @@
-"""Structure from motion by pycolmap: features, matches and models, each kept once it is made.
+"""Structure from motion by pycolmap, on the CPU: features, matches and models.
 
-All of it runs on the CPU. The database keeps features and matches, so that a run that was killed
-goes on with what is missing; only the last part, the mapping, begins anew. Compared are photographs
-that are near by GPS, next ones in order, or all.
+The database keeps features and matches for the next run, if one is killed; the mapping begins anew.
+Compared are photographs that are near by GPS, next ones in order, or all.
 """
 
 from __future__ import annotations
@@ -31,13 +30,11 @@ ENOUGH = 20
 """Photographs from which on a lens gets its full model: fewer would let it bend the scene."""
 CHUNK, PAIRS_A_CHUNK = 4, 100
 """Photographs and pairs for each thread between two looks at the progress bar."""
-DATABASE, ENTERED = "colmap/database.db", "colmap/entered"
-"""In the folder of the scene: features and matches, and a file that says all photographs are known
-there."""
+DATABASE, ENTERED, MODELS = "colmap/database.db", "colmap/entered", "colmap/models"
+"""In the folder of the scene: features and matches, a file that says all photographs are known
+there, and COLMAP's models."""
 BYTES_A_PHOTOGRAPH = 1_000_000
 """Of disk for features and matches: a survey of 800 pixels took 0.74 million."""
-MODELS = "colmap/models"
-"""COLMAP's models, in the folder of the scene."""
 MASKS = "masks"
 """Folder of masks, named NAME.png for a photograph NAME; what is black in one has no features."""
 EXTRA = "pip install 'pycolmap>=4' pillow-heif"
@@ -61,9 +58,8 @@ class Reconstructor:
 
     def __init__(self, scene: Path, photographs: Sequence[Photograph], threads: int) -> None:
         """With the folder of the scene, whose `images` has all copies, and MASKS some masks."""
-        self.pycolmap, self.masks = load_pycolmap(), scene / MASKS
-        self.images, self.folder = scene / "images", scene / "colmap"
-        self.database = scene / DATABASE
+        self.pycolmap, self.scene, self.images = load_pycolmap(), scene, scene / "images"
+        self.folder, self.database = scene / "colmap", scene / DATABASE
         self.photographs, self.threads = photographs, threads
 
     def extract(self, lens: Lens, size: int) -> None:
@@ -74,31 +70,24 @@ class Reconstructor:
         options = pycolmap.FeatureExtractionOptions()
         options.max_image_size, options.num_threads, options.use_gpu = size, self.threads, False
         reader = pycolmap.ImageReaderOptions()
-        if self.masks.is_dir():
-            reader.mask_path = self.masks
+        if (self.scene / MASKS).is_dir():
+            reader.mask_path = self.scene / MASKS
         with pycolmap.Database.open(self.database) as database:
-            done = {
-                image.name
-                for image in database.read_all_images()
-                if database.exists_descriptors(image.image_id)
-            }
+            images, known = database.read_all_images(), database.exists_descriptors
+            done = {image.name for image in images if known(image.image_id)}
         names = [each.name for each in self.photographs if each.name not in done]
         chunk, count = CHUNK * self.threads, len(self.photographs)
+        given: dict[str, Any] = {"reader_options": reader, "extraction_options": options}
+        given["device"] = pycolmap.Device.cpu
         with bar("finding features") as show:
             for at in range(0, len(names), chunk):
-                pycolmap.extract_features(
-                    self.database,
-                    self.images,
-                    names[at : at + chunk],
-                    reader_options=reader,
-                    extraction_options=options,
-                    device=pycolmap.Device.cpu,
-                )
+                some = names[at : at + chunk]
+                pycolmap.extract_features(self.database, self.images, some, **given)
                 show((count - len(names) + at) / count)
 
     def _enter(self, lens: Lens) -> None:
         """Enters photographs and lenses into the database, all or none of them."""
-        pycolmap, whole = self.pycolmap, self.folder / Path(ENTERED).name
+        pycolmap, whole = self.pycolmap, self.scene / ENTERED
         if whole.exists():
             return
         for part in self.folder.glob(f"{self.database.name}*"):
@@ -109,9 +98,9 @@ class Reconstructor:
         for each in self.photographs:
             groups.setdefault(each.lens, []).append(each)
         pycolmap.Database.open(self.database).close()
+        mode = pycolmap.CameraMode.SINGLE
         for group in groups.values():
             names = [each.name for each in group]
-            mode = pycolmap.CameraMode.SINGLE
             pycolmap.import_images(self.database, self.images, mode, names, options)
         with pycolmap.Database.open(self.database) as database:
             for each in (group[0] for group in groups.values()):
@@ -125,7 +114,7 @@ class Reconstructor:
 
     def match(self, chosen: Pairs) -> None:
         """Compares chosen pairs of photographs, those left out that were compared before."""
-        pycolmap = self.pycolmap
+        pycolmap, cpu = self.pycolmap, self.pycolmap.Device.cpu
         options = pycolmap.FeatureMatchingOptions()
         options.num_threads, options.use_gpu = self.threads, False
         chunk, count = PAIRS_A_CHUNK * self.threads, len(chosen.pairs)
@@ -137,15 +126,13 @@ class Reconstructor:
                 some = chosen.pairs[at : at + chunk]
                 lines = "".join(f"{names[one]} {names[other]}\n" for one, other in some)
                 pairing.match_list_path.write_text(lines)
-                pycolmap.match_image_pairs(
-                    self.database, options, pairing, device=pycolmap.Device.cpu
-                )
+                pycolmap.match_image_pairs(self.database, options, pairing, device=cpu)
                 show(at / count)
 
     def map(self) -> list[Any]:
         """COLMAP's models, that with the most photographs first. InputError if no photographs
         overlap."""
-        pycolmap, folder = self.pycolmap, self.folder / Path(MODELS).name
+        pycolmap, folder = self.pycolmap, self.scene / MODELS
         whole = folder / "all"
         if not whole.exists():
             shutil.rmtree(folder, ignore_errors=True)  # of a run that was killed
@@ -160,15 +147,10 @@ class Reconstructor:
                 placed += more
                 show(min(1.0, placed / len(self.photographs)))
 
+            calls: dict[str, Any] = {"initial_image_pair_callback": lambda: count(2)}
+            calls["next_image_callback"] = lambda: count(1)
             with bar("placing photographs") as show:
-                pycolmap.incremental_mapping(
-                    self.database,
-                    self.images,
-                    folder,
-                    options,
-                    initial_image_pair_callback=lambda: count(2),
-                    next_image_callback=lambda: count(1),
-                )
+                pycolmap.incremental_mapping(self.database, self.images, folder, options, **calls)
             whole.touch()
         paths = [path for path in folder.iterdir() if path.is_dir()]
         models = [pycolmap.Reconstruction(path) for path in paths]
@@ -185,8 +167,7 @@ class Reconstructor:
         pycolmap = self.pycolmap
         used = [model.images[number].camera_id for number in model.reg_image_ids()]
         frequent = [number for number in model.cameras if used.count(number) >= ENOUGH]
-        for number in frequent:
-            camera = model.cameras[number]
+        for camera in (model.cameras[number] for number in frequent):
             focal, x, y, distortion = camera.params
             camera.model = getattr(pycolmap.CameraModelId, FULL[lens])
             camera.params = np.array([focal, focal, x, y, distortion, 0.0, 0.0, 0.0])
@@ -203,18 +184,16 @@ class Reconstructor:
 
 
 def require_disk(scene: Path, photographs: int, copies: float, option: str) -> None:
-    """InputError if the disk of a scene's folder is too full for features of a number of
-    photographs and for bytes of copies: pycolmap would abort the process in the middle. `option`
-    names the folder."""
+    """InputError if the disk of a scene's folder, given as `option`, is too full for features of so
+    many photographs and for bytes of copies: pycolmap would abort the process in the middle."""
     database = scene / DATABASE
     known = database.stat().st_size if database.exists() else 0
     needed = copies + max(0, BYTES_A_PHOTOGRAPH * photographs - known)
     free = shutil.disk_usage(scene).free
     if free < needed:
-        raise InputError(
-            f"{option} {scene}: {free / 1e6:.0f} MB are free on its disk, and {needed / 1e6:.0f} "
-            "are needed: free some, or give a folder on another disk"
-        )
+        room = f"{free / 1e6:.0f} MB are free on its disk, and {needed / 1e6:.0f} are needed"
+        remedy = "free some, or give a folder on another disk"
+        raise InputError(f"{option} {scene}: {room}: {remedy}")
 
 
 FEW = 40
@@ -240,27 +219,23 @@ class Pairs(NamedTuple):
 
 
 def choose_pairs(names: Sequence[str], exifs: Sequence[Exif], places: NDArray[np.float64]) -> Pairs:
-    """The pairs to compare, of photographs by name, EXIF and place [N, 3] in metres, nan where
-    unknown."""
+    """The pairs to compare of photographs by name, EXIF and place [N, 3] in metres, or nan."""
     count = len(names)
     everything = list(combinations(range(count), 2))
-    if count <= FEW:
-        return Pairs(everything, "all pairs")
     order = capture_order(names, exifs)
     steps = {*range(1, NEXT + 1), *(2**power for power in range(count.bit_length()))}
     known = np.isfinite(places[:, 0])
     numbers = known.nonzero()[0]
-    if known.mean() >= 0.5 and _spread(places[known, :2]) >= WIDE:
+    if count > FEW and known.mean() >= 0.5 and _spread(places[known, :2]) >= WIDE:
         near = _near(places[numbers, :2], np.arange(NEIGHBOURS))
         found = {(int(numbers[one]), int(numbers[other])) for one, other in near}
         contradict = order is not None and _is_astray(places[order, :2])
         found |= _in_order(order or [], steps if contradict else (1, 2))
-        lost = [number for number in range(count) if not known[number]]
-        around = _in_order(order, steps) if order else set(everything)
-        found |= {pair for pair in around if {*pair} & {*lost}}
+        lost, around = {*(~known).nonzero()[0].tolist()}, _in_order(order or [], steps)
+        found |= {pair for pair in (around if order else everything) if not lost.isdisjoint(pair)}
         also = ", and next in order, which GPS contradicts" if contradict else ""
         return Pairs(sorted(found), f"{NEIGHBOURS} nearest by GPS{also}")
-    if order is None or count <= ANCHORS:
+    if order is None or count <= ANCHORS:  # few are all compared
         return Pairs(everything, "all pairs")
     anchors = order[:: -(-count // ANCHORS)]
     loops = {(min(pair), max(pair)) for pair in combinations(anchors, 2)}
@@ -295,8 +270,7 @@ def choose_posed_pairs(poses: NDArray[np.float64]) -> Pairs:
 
 
 def capture_order(names: Sequence[str], exifs: Sequence[Exif]) -> list[int] | None:
-    """Numbers of the photographs as they were taken, by EXIF's time or as names count; None if
-    neither tells."""
+    """Numbers of the photographs as taken, by EXIF's time or as names count; None if untold."""
     times = [each.time for each in exifs if each.time is not None]
     if len(times) == len(names) and 2 * len(set(times)) > len(names):
         return sorted(range(len(names)), key=lambda number: (exifs[number].time, names[number]))
@@ -314,8 +288,8 @@ def capture_order(names: Sequence[str], exifs: Sequence[Exif]) -> list[int] | No
 def _near(
     places: NDArray[np.float64], ranks: NDArray[np.int64], ahead: NDArray[np.float64] | None = None
 ) -> set[tuple[int, int]]:
-    """Pairs of each photograph with others near to its place [N, 2 or 3], by `ranks` of distance;
-    those that look another way, [N, 3] if given, are left out."""
+    """Pairs of each photograph with others near to its place [N, 2 or 3], by `ranks` of distance,
+    but for those that look another way, [N, 3] if given."""
     found = set()
     for row in range(len(places)):
         distances = ((places - places[row]) ** 2).sum(axis=1)

@@ -272,7 +272,8 @@ def test_the_summary_names_some_and_counts_the_rest() -> None:
         "not_read": ["cut.jpg"],
         "altitudes": False,
         "other_blocks": [],
-        "gps": {"used": True, "photographs": 8, "median_metres": 1.234, "most_metres": 5.0},
+        "gps": {"used": True, "photographs": 8, "median_metres": 1.234, "most_metres": 5.0}
+        | {"contradicted": []},
     }
     assert summary(report) == [
         "8 of 20 photographs are placed, with 9 points (0.50 pixels mean error)",
@@ -306,7 +307,7 @@ def test_photographs_whose_gps_contradicts_their_poses_are_named() -> None:
     report = _report([model], {f"{number}.jpg": f"{number}.jpg" for number in range(5)}, placement)
     assert report["gps"]["photographs"] == 3 and report["gps"]["most_metres"] == 3.0
     assert report["gps"]["contradicted"] == ["2.jpg"]
-    said = summary(report | {"not_read": []})
+    said = summary(report | {"not_read": [], "altitudes": True})
     assert said[-1] == "GPS contradicts the poses by more than 50 m, and is not used, of 2.jpg"
 
 
