@@ -1,8 +1,7 @@
 """Where a scene lies, found from cameras and sparse points: its mapping and the rays' range.
 
-A scene photographed from above is bounded: its rays are cut at a plane above and one below all
-points, as Mega-NeRF cuts them by altitude, and space is not contracted. Everything else is
-contracted, with the points in the uncontracted cube. Either choice can be made by hand.
+A scene photographed from above is bounded, between a plane above and one below all points, as
+Mega-NeRF does it. Everything else is contracted, with the points in the uncontracted cube.
 """
 
 from __future__ import annotations
@@ -73,13 +72,11 @@ def find_bounds(
     """Bounds from camera poses, some of the cameras' rays, and sparse points.
 
     Poses [C, 3, 4] are OpenGL's, in scene units; unit directions [C, K, 3] cover each image, its
-    corners included; points are [P, 3] or None. InputError if there are no cameras, a pose is not
-    finite, no camera sees a point, or configured altitudes are no range that rays go down to.
+    corners included; points are [P, 3] or None. InputError if a pose is not finite, no camera sees
+    a point, or configured altitudes are no range that rays go down to.
     """
     config = config or BoundsConfig()
     poses, directions = (part.detach().float().cpu() for part in (camera_to_worlds, directions))
-    if len(poses) == 0:
-        raise InputError("the scene has no cameras")
     if not bool(poses.isfinite().all()):
         raise InputError("a camera pose holds values that are not finite")
     points = usable_points(points)
@@ -122,8 +119,7 @@ def usable_points(points: Tensor | None) -> Tensor | None:
 
 
 def with_range(bounds: SceneBounds, near: float | None, far: float | None) -> SceneBounds:
-    """The bounds with near and far set by hand; None leaves what was found. InputError for an empty
-    range, or one that begins at the camera."""
+    """The bounds with near and far, if set by hand. InputError for an empty range, or near 0."""
     near, far = bounds.near if near is None else near, bounds.far if far is None else far
     if not 0.0 < near < far < math.inf:
         raise InputError(f"rays need 0 < near < far, got near {near:g} and far {far:g}")
@@ -131,26 +127,18 @@ def with_range(bounds: SceneBounds, near: float | None, far: float | None) -> Sc
 
 
 def raise_to_cameras(bounds: SceneBounds, heights: Tensor, seen: float) -> SceneBounds:
-    """The bounds of a scene from above, raised to its cameras, of heights z [C].
-
-    For pictures that show something (`seen`, a share of the rays) where rays miss what the sparse
-    points bound: fog, which has no points, or a sky, which a cube with walls holds before its
-    backdrop.
-    """
+    """The bounds of a scene from above, raised to its cameras, of heights z [C]: where rays beyond
+    show something (`seen`, a share of all), as fog, which has no points, or a sky."""
     ground, highest = float(bounds.aabb[2]), float(heights.max())
     top = max(float(bounds.aabb[5]), highest + OVER_CAMERAS * (highest - ground))
     x, y = bounds.center[:2].tolist()
     half = max(bounds.half_extent, 1.02 * (top - ground) / 2)
+    center = torch.tensor([x, y, (ground + top) / 2])
     aabb = torch.tensor([x - half, y - half, ground, x + half, y + half, top])
-    return replace(
-        bounds,
-        center=torch.tensor([x, y, (ground + top) / 2]),
-        half_extent=half,
-        near=min(bounds.near, NEAR_CAMERAS * bounds.far),
-        aabb=aabb,
-        reason=f"{bounds.reason}; raised to z = {top:.3f}, above the cameras: {seen:.1%} of the "
-        "rays go beyond and show something",
-    )
+    reason = f"{bounds.reason}; raised to z = {top:.3f}, above the cameras: {seen:.1%} of the rays"
+    reason += " go beyond and show something"
+    near = min(bounds.near, NEAR_CAMERAS * bounds.far)
+    return SceneBounds("box", center, half, near, bounds.far, aabb, reason, bounds.lowest)
 
 
 def _range(depths: Tensor) -> Span:
@@ -202,10 +190,10 @@ def _slab(
 
 
 def _room(poses: Tensor, low: Tensor, high: Tensor, near: float, far: float) -> SceneBounds:
-    """A bounded scene with walls around its points and its cameras, an eighth beyond them."""
+    """A bounded scene with walls around its points and its cameras."""
     places = poses[:, :, 3]
     low, high = torch.minimum(low, places.amin(dim=0)), torch.maximum(high, places.amax(dim=0))
-    margin = 0.125 * float((high - low).max())
+    margin = 0.125 * float((high - low).max())  # an eighth
     low, high = low - margin, high + margin
     half = float((high - low).max()) / 2
     reason = "as configured: bounded, rays cut at walls around points and cameras"

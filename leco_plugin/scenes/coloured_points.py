@@ -1,7 +1,5 @@
-"""What a scene's files say of places: colours of sparse points nearby, photographs that show them.
-
-All in the coordinates of the scene's own files.
-"""
+"""What a scene's files say of places, in their coordinates: colours of sparse points nearby, and
+photographs that show them."""
 
 from __future__ import annotations
 
@@ -45,13 +43,10 @@ def description_of_run(file: Path) -> Path | None:
 
     config = file.resolve().parent / CONFIG
     data = _data_named_in(config)
-    if data is None:
-        return None
-    found = file_in(data)
-    if not found.is_file():
-        there = found_around(data, config.parent)
-        found = found if there is None else file_in(there)
-    return found if found.is_file() else None
+    for place in () if data is None else (data, found_around(data, config.parent)):
+        if place is not None and (found := file_in(place)).is_file():
+            return found
+    return None
 
 
 def _data_named_in(config: Path) -> Path | None:
@@ -99,9 +94,8 @@ def read_cloud(path: Path) -> CloudFile:
         paint = loaded.visual.vertex_colors if is_mesh else getattr(loaded, "colors", ())
         colours = np.asarray(paint, dtype=np.uint8)
     except Exception as error:  # noqa: BLE001  trimesh raises whatever its parsers meet
-        raise InputError(
-            f"{path} cannot be read as sparse points: {one_line(error, 120)}"
-        ) from None
+        why = one_line(error, 120)
+        raise InputError(f"{path} cannot be read as sparse points: {why}") from None
     sound = np.isfinite(positions).all(axis=1)
     known = len(colours) == len(positions) > 0
     return CloudFile(positions[sound], colours[sound, :3] if known else None)
@@ -145,8 +139,8 @@ PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "P
 
 
 def views_of(description: Path, places: NDArray[np.float64]) -> NDArray[np.int64] | None:
-    """How many photographs of a transforms.json may show places [N, 3], for all that hides them:
-    [N]; None where it does not say how they were taken, or by a lens that sees around corners."""
+    """How many photographs of a transforms.json may show places [N, 3], whatever hides them: [N];
+    None where it does not say by which lens, or that is no pinhole."""
     meta = load_json(description)
     counts = np.zeros(len(places), dtype=np.int64)
     try:
@@ -176,8 +170,8 @@ def views_of(description: Path, places: NDArray[np.float64]) -> NDArray[np.int64
 def _bend(
     slopes: NDArray[np.float64], k1: float, k2: float
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Slopes [N, 2] as a lens with radial distortion bends them, and whether it is folded there, so
-    that they lie further out than its image goes: [N]."""
+    """Slopes [N, 2] as a lens with radial distortion bends them, and whether it folds there: [N],
+    further out than its image goes."""
     squares = (slopes**2).sum(axis=1)
     factor = 1.0 + k1 * squares + k2 * squares**2
     return slopes * factor[:, None], 1.0 + 3.0 * k1 * squares + 5.0 * k2 * squares**2 <= 0.0

@@ -11,15 +11,10 @@ from typing import Any, Literal
 
 import torch
 from nerfstudio.cameras.cameras import CameraType
-from nerfstudio.data.datamanagers.base_datamanager import (
-    VanillaDataManager,
-    VanillaDataManagerConfig,
-)
+from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager as Vanilla
+from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
-from nerfstudio.data.utils.dataloaders import (
-    FixedIndicesEvalDataloader,
-    RandIndicesEvalDataloader,
-)
+from nerfstudio.data.utils import dataloaders
 from nerfstudio.model_components.ray_generators import RayGenerator
 from torch import Tensor
 
@@ -58,7 +53,7 @@ class LecoDataManagerConfig(VanillaDataManagerConfig):
     None is what gives as many of them as are wanted: 11, in small scenes down to 5."""
 
 
-class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
+class LecoDataManager(Vanilla):  # type: ignore[type-arg]
     """As nerfstudio's, but for where the photographs are, and what is up."""
 
     config: LecoDataManagerConfig
@@ -71,8 +66,7 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
     @dataparser.setter
     def dataparser(self, parser: Any) -> None:
         self._dataparser = parser = read_checked(parser)
-        # nerfstudio sets this class as the target of configs that an earlier release stored
-        if getattr(self.config, "upright", False):
+        if self.config.upright:
             parser.get_dataparser_outputs = upright_outputs(parser.get_dataparser_outputs)
 
     def create_train_dataset(self) -> Any:
@@ -90,9 +84,9 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
             if len(dataset) == 0:
                 say(f"no test image: the run trains on all {count} and evaluates nothing")
         if len(dataset) == 0:
+            lack = f"{self.get_datapath()} has no test image in this run"
             none: Any = NoTestImages(
-                f"{self.get_datapath()} has no test image in this run, and nothing can be "
-                "evaluated; ns-render shows what it has learned"
+                f"{lack}, and nothing can be evaluated; ns-render shows what it has learned"
             )
             self.eval_dataloader = self.fixed_indices_eval_dataloader = none
         return dataset
@@ -114,37 +108,34 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
             if radius is not None and 0 < int(fisheyes.sum()) < len(fisheyes):
                 sampler.radii = torch.where(fisheyes, float(radius), math.inf)
                 sampler.config.fisheye_crop_radius = None
-            period = getattr(self.config, "held_out_period", None)
-            sampler.lattice = (
-                lattice_for(picture_sizes(dataset)) if period is None else Lattice(period)
-            )
+            period, sizes = self.config.held_out_period, picture_sizes(dataset)
+            sampler.lattice = lattice_for(sizes) if period is None else Lattice(period)
         return sampler
 
     def on_disk(self) -> bool:
         """Whether pixels are read from files. InputError if they are to be, and cannot."""
         config = self.config
-        wanted = getattr(config, "images", "auto")
-        if wanted == "memory" or not keeps_all_images(config, len(self.train_dataset)):
+        if config.images == "memory" or not keeps_all_images(config, len(self.train_dataset)):
             return False
         obstacle = None
         if not issubclass(config.pixel_sampler._target, HeldOutPixelSampler):
             obstacle = "the pixel sampler draws from images in memory only; use leco's own"
         elif self.train_dataset.mask_color:
             obstacle = "the scene's mask_color is painted over images in memory only"
-        if wanted == "disk":
-            if obstacle is not None:
-                raise InputError(f"photographs on disk: {obstacle}")
-            return True
+        if config.images == "disk" and obstacle is not None:
+            raise InputError(f"photographs on disk: {obstacle}")
+        if config.images == "disk" or obstacle is not None:
+            return obstacle is None
         needed = decoded_bytes(self.train_dataset) + decoded_bytes(self.eval_dataset)
-        free = free_memory()
         needed *= max(1, self.world_size)  # each process decodes its own
-        return obstacle is None and free is not None and needed > MOST_OF_MEMORY * free
+        free = free_memory()
+        return free is not None and needed > MOST_OF_MEMORY * free
 
     def _store(self, dataset: Any, what: str) -> Any:
         """An endless iterator over the one batch of images that there is."""
         data = Path(self.config.dataparser.data)
         beside = data if data.is_dir() else data.parent
-        folder = getattr(self.config, "pixels", None) or beside / "leco-cache" / "pixels"
+        folder = self.config.pixels or beside / "leco-cache" / "pixels"
         return itertools.repeat(store_pictures(dataset, folder, what))
 
     def setup_train(self) -> None:
@@ -169,8 +160,8 @@ class LecoDataManager(VanillaDataManager):  # type: ignore[type-arg]
         self.eval_pixel_sampler = self._get_pixel_sampler(self.eval_dataset, rays)
         self.eval_ray_generator = RayGenerator(self.eval_dataset.cameras.to(self.device))
         given: dict[str, Any] = {"input_dataset": self.eval_dataset, "device": self.device}
-        self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(**given)
-        self.eval_dataloader = RandIndicesEvalDataloader(**given)
+        self.fixed_indices_eval_dataloader = dataloaders.FixedIndicesEvalDataloader(**given)
+        self.eval_dataloader = dataloaders.RandIndicesEvalDataloader(**given)
 
 
 @dataclass
@@ -215,17 +206,15 @@ def _turn_of(outputs: DataparserOutputs) -> Tensor | None:
 
 
 def read_in_words(data: Path, training: Any, tests: int) -> str:
-    """What was read of a scene (folder or file, training dataset, number of test photographs): one
-    line."""
+    """One line on what was read of a scene's folder or file."""
     sizes = picture_sizes(training)
     height, width = sizes.amax(dim=0).tolist()
     size = f"{'' if bool((sizes == sizes[0]).all()) else 'up to '}{width} x {height}"
     points = points_in(training.metadata)
     found = "no sparse points" if points is None else f"{len(points):,} sparse points"
     name = (data if data.is_dir() else data.parent).resolve().name
-    return (
-        f"{name}: {len(training)} photographs to learn from, {tests} to test with, {size}; {found}"
-    )
+    counts = f"{len(training)} photographs to learn from, {tests} to test with"
+    return f"{name}: {counts}, {size}; {found}"
 
 
 def decoded_bytes(dataset: Any) -> int:

@@ -1,8 +1,7 @@
 """The coordinates of a scene: frames of its readers, lengths and altitudes, poses, what is up.
 
-nerfstudio's readers turn, move and scale a scene, each in its own way. What was learned in the
-coordinates of one is asked in those of another, and what a reader says it did leads back to the
-units of the data.
+nerfstudio's readers turn, move and scale a scene, each in its own way. What a reader says it did
+leads to the coordinates of another, and back to the units of the data.
 """
 
 from __future__ import annotations
@@ -25,28 +24,22 @@ from leco_plugin.scenes.input_error import InputError
 
 def frame_of(datamanager: Any) -> list[list[float]] | None:
     """What took the scene's coordinates to the model's: [3, 4], JSON values; None is not known. The
-    scene's are those of its reconstruction, before any `applied_transform`, so that all readers of
-    it mean the same."""
+    scene's are those before any `applied_transform`, the same for all readers."""
     outputs = getattr(datamanager, "train_dataparser_outputs", None)
-    if outputs is None:
-        return None
-    frame: list[list[float]] = parsed_frame(outputs).tolist()
-    return frame
+    return None if outputs is None else parsed_frame(outputs).tolist()
 
 
 def data_frame_of(datamanager: Any) -> list[list[float]] | None:
-    """What took positions in the data's own files to the model's: [3, 4], JSON values. It differs
-    from `frame_of` where a transforms.json has an `applied_transform`."""
+    """The same from positions in the data's own files, after any `applied_transform`."""
     frame = frame_of(datamanager)
     if frame is None:
         return None
     metadata = getattr(datamanager.train_dataparser_outputs, "metadata", None) or {}
     applied, scale = metadata.get(APPLIED, (None, 1.0))
     try:
-        of_file: list[list[float]] = from_file(frame, applied, scale, torch.float64).tolist()
+        return from_file(frame, applied, scale, torch.float64).tolist()
     except (ValueError, TypeError, RuntimeError):  # it leads nowhere back
         return None
-    return of_file
 
 
 def parsed_frame(outputs: Any) -> Tensor:
@@ -69,14 +62,8 @@ SAME_PLACE = 1e-3
 
 
 def applied_in(meta: dict[str, Any], folder: Path) -> tuple[Any, float]:
-    """What was done to the scene's coordinates before a transforms.json was written.
-
-    Args:
-        meta: what the file says.
-        folder: that it lies in.
-    Returns:
-        `applied_transform` [3, 4], or None, and `applied_scale`.
-    """
+    """What was done to the scene's coordinates before a transforms.json was written in a folder:
+    `applied_transform` [3, 4], or None, and `applied_scale`."""
     applied = meta.get("applied_transform")
     if applied is None and (folder / "colmap/sparse/0").exists():
         applied = APPLIED_EARLIER
@@ -89,17 +76,9 @@ def from_file(
     applied_scale: float = 1.0,
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """The frame for positions as a transforms.json has them: [3, 4].
-
-    What ns-process-data has done to poses and points before it wrote them, a frame does too.
-
-    Args:
-        frame: [3, 4] from the scene's coordinates, as of `frame_of`.
-        applied_transform, applied_scale: of that file, as of `applied_in`.
-        dtype: of the frame. Coordinates as large as UTM's need float64.
-    Raises:
-        ValueError: they are not finite, or lead nowhere back.
-    """
+    """The frame for positions as a transforms.json has them, [3, 4], by that of `frame_of` and what
+    `applied_in` says of the file. Coordinates as large as UTM's need float64. ValueError if they
+    are not finite, or lead nowhere back."""
     frame = torch.as_tensor(frame, dtype=torch.float64)
     applied = torch.eye(3, 4) if applied_transform is None else applied_transform
     matrix = torch.as_tensor(applied, dtype=torch.float64)
@@ -153,12 +132,10 @@ def box_around(box: Tensor, frame: Tensor) -> Tensor:
     return torch.cat([corners.amin(dim=0), corners.amax(dim=0)])
 
 
-METRES_PER_UNIT = "leco_metres_per_unit"
-"""Key of a dataparser's metadata: metres in a unit of the dataset's own poses, float."""
-ALTITUDES = "leco_altitudes"
-"""Key of a dataparser's metadata: z of the ground and of the top, scene units, two floats."""
-UP_IS_KNOWN = "leco_up_is_known"
-"""Key of a dataparser's metadata: there where z is up in the dataset already."""
+# Keys of a dataparser's metadata
+METRES_PER_UNIT = "leco_metres_per_unit"  # metres in a unit of the dataset's own poses, float
+ALTITUDES = "leco_altitudes"  # z of the ground and of the top, scene units, two floats
+UP_IS_KNOWN = "leco_up_is_known"  # there where z is up in the dataset already
 UPRIGHT = 0.94
 """Cosine of 20 degrees: an axis of the dataset that is nearer to the model's z is up there, and
 what is nearer to z in a survey may be the slope of a hill."""
@@ -172,8 +149,7 @@ class DatasetUnits:
     """Metres, or units of the dataset's poses, in a scene unit."""
     zero: float
     """Altitude of the scene's origin in the same units: along the dataset's own axis where one is
-    up, for a tilt of a hundredth of a degree is a kilometre in coordinates of UTM; else along the
-    model's z."""
+    up (in UTM a hundredth of a degree is a kilometre), else along the model's z."""
     metric: bool
     """Whether these units are metres."""
 
@@ -188,15 +164,13 @@ class DatasetUnits:
 
 def units_of(datamanager: Any, metres_per_unit: float | None = None) -> DatasetUnits | None:
     """The units of a data manager's dataset; None where its dataparser does not say what it did.
-    InputError unless `metres_per_unit` of its poses is positive, or None: what the dataparser
-    knows."""
+    `metres_per_unit` of its poses goes before what that knows; InputError if it is not positive."""
     outputs = getattr(datamanager, "train_dataparser_outputs", None)
     scale = float(getattr(outputs, "dataparser_scale", 0.0))
     if outputs is None or not 0.0 < scale < math.inf:
         return None
-    known = metres_per_unit
-    if known is None:
-        known = (outputs.metadata or {}).get(METRES_PER_UNIT)
+    read = (outputs.metadata or {}).get(METRES_PER_UNIT)
+    known = read if metres_per_unit is None else metres_per_unit
     if known is not None and not 0.0 < float(known) < math.inf:
         raise InputError(f"a unit of the dataset is a positive number of metres, not {known}")
     metres = 1.0 if known is None else float(known)
@@ -205,9 +179,8 @@ def units_of(datamanager: Any, metres_per_unit: float | None = None) -> DatasetU
     near = up.abs().argmax()
     if float(up[near].abs()) > UPRIGHT:
         up = torch.zeros_like(up).index_fill_(0, near, up[near].sign())
-    return DatasetUnits(
-        metres / scale, metres * float(up @ inverse(frame)[:, 3]), known is not None
-    )
+    zero = metres * float(up @ inverse(frame)[:, 3])
+    return DatasetUnits(metres / scale, zero, known is not None)
 
 
 SKEW = 0.05
@@ -215,15 +188,13 @@ SKEW = 0.05
 
 
 def distance_from_rotations(matrices: NDArray[np.floating]) -> NDArray[np.floating]:
-    """How far finite [C, 3, 3] are from rotations: the largest error of R R^T = 1 and of det R = 1,
-    [C]; a mirrored rotation has 2."""
+    """How far finite [C, 3, 3] are from R R^T = 1 and det R = 1: [C]."""
     errors = np.abs(matrices @ matrices.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
     return np.maximum(errors, np.abs(np.linalg.det(matrices) - 1.0))
 
 
 def check_poses(poses: NDArray[np.floating], names: list[str]) -> None:
-    """InputError, with its name, for one of poses [C, 3, 4] or [C, 4, 4] that is not finite or
-    whose first three columns are no rotation."""
+    """InputError, with its name, for one of poses [C, 3 or 4, 4] that is not finite or turned."""
     if poses.shape[1:] not in ((4, 4), (3, 4)):
         raise InputError(f"{names[0]} is no finite 4 x 4 matrix: give it four rows of four")
     broken = ~np.isfinite(poses).all(axis=(1, 2))
@@ -262,8 +233,8 @@ holds all photographs alike, are closer together."""
 def turn_to_upright(poses: Tensor, points: Tensor | None) -> Tensor | None:
     """The rotation [3, 3] that sets a survey from the air upright; None if it is, or is no survey.
 
-    Up is where the cameras are over a flat ground, where their right axes are level, or where they
-    fly in a layer, whichever is known. Poses are [C, 3, 4] OpenGL's, points [P, 3] or None.
+    Up is over a flat ground, where right axes are level, or across the layer in which cameras fly,
+    whichever is known. Poses are [C, 3, 4] OpenGL's, points [P, 3] or None.
     """
     poses = poses.detach().double().cpu()
     looks, places = -poses[:, :, 2], poses[:, :, 3]
@@ -271,16 +242,10 @@ def turn_to_upright(poses: Tensor, points: Tensor | None) -> Tensor | None:
         return None
     if points is not None:
         points = _without_strays(points.detach().double().cpu())
-    candidates = (
-        _normal_of_layer(points) if points is not None else None,
-        _vertical_of(poses[:, :, 0]),
-        _normal_of_layer(places),
-    )
-    ups = [
-        -found if float((looks @ found).mean()) > 0.0 else found
-        for found in candidates
-        if found is not None
-    ]
+    ground = None if points is None else _normal_of_layer(points)
+    known = (ground, _vertical_of(poses[:, :, 0]), _normal_of_layer(places))
+    axes = [each for each in known if each is not None]
+    ups = [-axis if float((looks @ axis).mean()) > 0.0 else axis for axis in axes]
     ups = [up for up in ups if float((looks @ up < DOWN).double().mean()) >= MOSTLY]
     ups = [up for up in ups if _fly_over(poses, points, up)]
     if not ups or any(float(up[2]) > UPRIGHT for up in ups):

@@ -13,11 +13,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from nerfstudio.data.dataparsers.base_dataparser import (
-    DataParser,
-    DataparserOutputs,
-    transform_poses_to_original_space,
-)
+from nerfstudio.data.dataparsers import base_dataparser
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 from nerfstudio.data.utils import colmap_parsing_utils
@@ -51,9 +48,8 @@ class ExactOutputs(DataparserOutputs):
         self, poses: Tensor, camera_convention: Any = "opencv"
     ) -> Tensor:
         """As nerfstudio's, in float64."""
-        return transform_poses_to_original_space(
-            poses.double(), self.dataparser_transform, self.dataparser_scale, camera_convention
-        )
+        given = self.dataparser_transform, self.dataparser_scale, camera_convention
+        return base_dataparser.transform_poses_to_original_space(poses.double(), *given)
 
 
 def with_transform(outputs: DataparserOutputs, transform: Tensor) -> DataparserOutputs:
@@ -80,9 +76,8 @@ class ReadsNear(DataParser):
         )
         near.__kwdefaults__ = read.__kwdefaults__
         outputs: DataparserOutputs = near(self, split, **kwargs)
-        meta = self._meta or {}
         if isinstance(self, Nerfstudio):
-            outputs.metadata[APPLIED] = applied_in(meta, self.config.data)
+            outputs.metadata[APPLIED] = applied_in(self._meta or {}, self.config.data)
         if self.shift is None or not self.shift.any():
             return outputs
         transform = torch.as_tensor(outputs.dataparser_transform).double()[:3].clone()
@@ -115,10 +110,9 @@ class ReadsNear(DataParser):
             origin = far_origin(positions)
             self.shift = np.zeros(3) if origin is None else origin
             if origin is not None:
-                say(
-                    f"coordinates are large: float32 would round them to {_rounding(origin):.2g}. "
-                    f"They are read relative to ({_listed(self._in_the_data())})"
-                )
+                large = f"float32 would round them to {_rounding(origin):.2g}"
+                near = f"They are read relative to ({_listed(self._in_the_data())})"
+                say(f"coordinates are large: {large}. {near}")
         if self.shift.any():
             positions -= self.shift
             for frame, pose in zip(meta["frames"], poses.tolist()):
@@ -147,8 +141,8 @@ class ReadsNear(DataParser):
 
 
 def near_bases(kind: type[DataParser]) -> tuple[type[DataParser], ...]:
-    """Bases of a class like this one, with `ReadsNear` before the reader that it takes its poses
-    from; the class itself where that is not known."""
+    """Bases of a class like this one, with `ReadsNear` before the reader of its poses; the class
+    itself where that is not known."""
     for owner in kind.__mro__ if not issubclass(kind, ReadsNear) else ():
         read = vars(owner).get("_generate_dataparser_outputs")
         if SEAMS & {*getattr(getattr(read, "__code__", None), "co_names", ())}:

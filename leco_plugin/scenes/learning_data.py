@@ -30,21 +30,18 @@ from leco_plugin.scenes.pixels.known_distances import (
     sampler_here,
     sparse_pixels,
 )
-from leco_plugin.scenes.survey import Survey, covering_rays, sparse_points, survey
+from leco_plugin.scenes.survey import MOST_CAMERAS, Survey, covering_rays, sparse_points, survey
 from leco_plugin.seen import rays_a_side
 
 FEW_PHOTOGRAPHS = 16
 """Below so many a scene often fails: nine of `fox`, without points, had 15 dB."""
-
-
 SHARE_THAT_VOUCHES = 4
 """At most one photograph of so many is kept from teaching, to vouch for what the others taught."""
 
 
 class LearningData:
-    """A data manager, nerfstudio's or one with its interface, as a learner sees it. Bounds, near
-    and far are what is set by hand. InputError if it hands out whole images, or no ray meets the
-    scene."""
+    """A data manager with nerfstudio's interface, as a learner sees it. Bounds, near and far are
+    what is set by hand. InputError as `survey`."""
 
     def __init__(
         self, manager: Any, bounds: BoundsConfig, near: float | None, far: float | None
@@ -58,22 +55,20 @@ class LearningData:
         """Rays of a batch before any factor; may be set."""
         return int(self.manager.get_train_rays_per_batch())
 
-    def covering_rays(self) -> tuple[Tensor, Tensor]:
-        """Origins and unit directions [N, 3] of rays that cover the training images."""
-        rays = covering_rays(self.manager.train_dataset.cameras, SIDE)
+    def covering_rays(self, side: int = SIDE, most: int = MOST_CAMERAS) -> tuple[Tensor, Tensor]:
+        """Origins and unit directions [N, 3] of rays that cover up to `most` training images."""
+        rays = covering_rays(self.manager.train_dataset.cameras, side, most)
         return rays[0].reshape(-1, 3), rays[1].reshape(-1, 3)
 
     def note_views(self, region: Region) -> None:
         """Tells a region what the training images see of it."""
         region.look(*self.covering_rays())
-        cameras = self.manager.train_dataset.cameras
-        rays = covering_rays(cameras, rays_a_side(len(cameras)), len(cameras))  # of each image some
-        region.see(rays[0].reshape(-1, 3), rays[1].reshape(-1, 3))
+        cameras = len(self.manager.train_dataset.cameras)
+        region.see(*self.covering_rays(rays_a_side(cameras), cameras))  # of each image some
 
     def prepare_batch(self, factor: float, distances: bool, set_aside: int = 0) -> None:
-        """Sets the next batch; one that is drawn elsewhere stays as it is. It has `factor` times
-        the config's rays, pixels of known distance if asked, and none of `set_aside` photographs
-        (`vouching`)."""
+        """Sets the next batch, if it is drawn here: `factor` times the config's rays, pixels of
+        known distance if asked, and none of `set_aside` photographs (`vouching`)."""
         sampler = sampler_here(self.manager)
         if isinstance(sampler, HeldOutPixelSampler):
             sampler.set_aside = None
@@ -94,18 +89,16 @@ class LearningData:
     @cached_property
     def sparse(self) -> SparsePixels | None:
         """Where sparse points are seen; projected only once learning asks for it."""
-        dataset: Any = self.manager.train_dataset
-        points = sparse_points(dataset)
-        if points is None:
+        dataset, sampler = self.manager.train_dataset, held_out_sampler(self.manager)
+        if (points := sparse_points(dataset)) is None:
             return None
-        sampler = held_out_sampler(self.manager)
         lattice = Lattice() if sampler is None else sampler.lattice
         return sparse_pixels(dataset.cameras, points, lattice)
 
     def vouching(self, count: int) -> Tensor:
         """Numbers of the training photographs that can vouch for what is learned from the others,
-        evenly spread: [count]. None [0] where they would be more than a quarter, or where batches
-        cannot do without them: drawn elsewhere, of some pictures at a time or one by one."""
+        evenly spread: [count]. None [0] where they would be more than a quarter, or batches are
+        not drawn here of all pictures at once."""
         if count not in self._vouching:
             photographs = len(self.manager.train_dataset)
             can = 0 < SHARE_THAT_VOUCHES * count <= photographs and self._draws_of_all(photographs)
@@ -161,15 +154,11 @@ class LearningData:
         """A line on each thing that often makes a scene fail, before anything is learned."""
         dataset, found = self.manager.train_dataset, []
         if len(dataset) < FEW_PHOTOGRAPHS:
-            found.append(
-                f"{len(dataset)} training photographs are few: new views may fail; more, which "
-                "overlap by two thirds, usually help"
-            )
+            few = f"{len(dataset)} training photographs are few: new views may fail"
+            found.append(f"{few}; more, which overlap by two thirds, usually help")
         if sparse_points(dataset) is None:
-            found.append(
-                "this scene has no sparse points, so that its bounds are guessed from its cameras; "
-                "`leco points SCENE` finds some (it needs pycolmap)"
-            )
+            why = "this scene has no sparse points, so that its bounds are guessed from its cameras"
+            found.append(f"{why}; `leco points SCENE` finds some (it needs pycolmap)")
         return found
 
     def facts(self) -> dict[str, Any]:
@@ -195,19 +184,15 @@ def training_bundles(manager: Any, count: int) -> Iterator[Any]:
 def held_out_bundle(
     manager: Any, count: int, seed: int = 0, share: Share = "calibration"
 ) -> tuple[RayBundle, Tensor]:
-    """Up to `count` rays of training pixels that are never trained on, and true colours [R, 3 or
-    4].
+    """Up to `count` rays of pixels that are never trained on, and true colours [R, 3 or 4].
 
-    They are of training images, whose appearance is known: an exposure that the mean of all does
-    not show would stand in every error, and hide what skipping adds to it. A data manager without
-    held-out pixels gives ordinary training rays; the report says so.
+    They are of training images, whose appearance is known: an unknown exposure would stand in every
+    error. A data manager without held-out pixels gives training rays; the report says so.
     """
-    sampler = held_out_sampler(manager)
-    if sampler is None:
+    if (sampler := held_out_sampler(manager)) is None:
         bundle, batch = manager.next_train(0)
         return bundle[:count], batch["image"][:count]
-    batch = sampler.sample_held_out(_images_of(manager), count, seed, share)
-    return _bundle_of(manager, batch)
+    return _bundle_of(manager, sampler.sample_held_out(_images_of(manager), count, seed, share))
 
 
 def _bundle_of(manager: Any, batch: dict[str, Tensor]) -> tuple[RayBundle, Tensor]:
@@ -237,8 +222,7 @@ def _as_rays(mixture: Mixture, bundle: RayBundle, truth: Tensor) -> tuple[Rays, 
 
 def count_held_out(manager: Any, limit: int) -> float:
     """How many pixels there are to check with, up to a limit; infinity if none is held out."""
-    sampler = held_out_sampler(manager)
-    if sampler is None:
+    if (sampler := held_out_sampler(manager)) is None:
         return math.inf
     return float(sampler.count_held_out(_images_of(manager), limit, "recheck"))
 
@@ -250,8 +234,5 @@ def on_black(image: Tensor) -> Tensor:
 
 def _images_of(manager: Any) -> dict[str, Any]:
     """Images to take held-out pixels from: those that are loaded, or some where none are here."""
-    loader = getattr(manager, "iter_train_image_dataloader", None)
-    if loader is None:
-        return some_images(manager.train_dataset)
-    loaded: dict[str, Any] = next(loader)
-    return loaded
+    loader: Any = getattr(manager, "iter_train_image_dataloader", None)
+    return some_images(manager.train_dataset) if loader is None else next(loader)

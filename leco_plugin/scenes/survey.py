@@ -1,5 +1,5 @@
-"""A look at the cameras before the first step: bounds, how many rays meet the scene, probe rays,
-and how much there is to see, counted in the smallest things that the photographs resolve."""
+"""A look at the cameras before the first step: bounds, rays that meet the scene, and its detail,
+counted in the smallest things that the photographs resolve."""
 
 from __future__ import annotations
 
@@ -58,8 +58,7 @@ class Survey:
     """A line on coordinates that its dataparser has rounded, if it has."""
 
     def lines(self) -> list[str]:
-        """For the log: what was chosen and why, the range in scene units and beside it in metres,
-        and how many rays meet it."""
+        """For the log: what was chosen and why, the range in its units, how many rays meet it."""
         bounds, heights, units = self.bounds, self.positions[:, 2], self.units
         lengths, levels = {"near": bounds.near, "far": bounds.far}, {}
         if bounds.kind == "box":
@@ -71,17 +70,15 @@ class Survey:
         for name, value in (lengths | levels).items():
             there = units and _in(units, float(value), name in levels)
             table.append(f"{name:18}{float(value):12.3f}" + (f"{there:12.2f}" if units else ""))
-        if units is not None and not units.metric:
-            table.append(
-                "data units are those of the poses; bounds.metres-per-unit says the metres"
-            )
         length = f"{self.median_length:.3f}"
         if units is not None and units.metric:
             length += f" ({_in(units, self.median_length, False):.1f} m)"
-        meeting = (
-            f"{self.meeting:.1%} of {self.rays} rays meet the scene, half of them for {length}"
-        )
-        return [bounds.reason, *table, meeting, *([self.rounded] if self.rounded else [])]
+        elif units is not None:
+            said = "bounds.metres-per-unit says the metres"
+            table.append(f"data units are those of the poses; {said}")
+        meeting = f"{self.meeting:.1%} of {self.rays} rays meet the scene, half of them for"
+        rounded = [self.rounded] if self.rounded else []
+        return [bounds.reason, *table, f"{meeting} {length}", *rounded]
 
     def summary(self) -> list[str]:
         """The same for a short screen: two lines, and a third of what was rounded."""
@@ -133,9 +130,10 @@ def survey(
     found from the data where they are None. InputError if there are no cameras, no ray meets the
     scene, or what is configured is no range."""
     if hasattr(datamanager, "train_unseen_cameras"):
+        kind = type(datamanager).__name__
         raise InputError(
-            f"{type(datamanager).__name__} hands out whole images, and this method trains on rays; "
-            "leave the method its own data manager, and see its option `images` to save memory"
+            f"{kind} hands out whole images, and this method trains on rays; leave the method its "
+            "own data manager, and see its option `images` to save memory"
         )
     dataset = datamanager.train_dataset
     config = with_known_altitudes(config, getattr(dataset, "metadata", {}) or {})
@@ -157,24 +155,14 @@ def survey(
     lengths = lengths_inside(bounds, flat_origins, flat_directions)
     hits = lengths > 0.0
     if not bool(hits.any()):
-        set_by_hand = near is not None or far is not None or config.altitudes is not None
-        cause = (
-            "near, far and altitudes are in scene units; leave them out to have them found"
-            if set_by_hand
-            else "the sparse points and the camera poses are probably in different coordinates"
-        )
+        cause = "the sparse points and the camera poses are probably in different coordinates"
+        if near is not None or far is not None or config.altitudes is not None:
+            cause = "near, far and altitudes are in scene units; leave them out to have them found"
         raise InputError(f"0% of the rays meet the scene ({bounds.reason}): {cause}")
-    return Survey(
-        bounds,
-        flat_origins[hits],
-        flat_directions[hits],
-        float(hits.float().mean()),
-        float(lengths[hits].median()),
-        origins[:, 0],
-        len(hits),
-        units,
-        rounded_by(datamanager),
-    )
+    probes = flat_origins[hits], flat_directions[hits]
+    meeting, median_length = float(hits.float().mean()), float(lengths[hits].median())
+    known = origins[:, 0], len(hits), units, rounded_by(datamanager)
+    return Survey(bounds, *probes, meeting, median_length, *known)
 
 
 def lengths_inside(bounds: SceneBounds, origins: Tensor, directions: Tensor) -> Tensor:
@@ -212,7 +200,7 @@ def covering_rays(
 
 
 def seen_beyond(dataset: Any, numbers: Tensor, misses: Tensor) -> float:
-    """Share of the rays that miss the scene but still show something, of `InputDataset` pictures
+    """Share of the rays that miss the scene but show something, of a dataset's pictures by number
     [C] with bool [C, side, side] of the rays of a grid that miss."""
     counts = misses.flatten(1).sum(dim=1)
     most = counts.argsort(descending=True)[:MOST_PICTURES]
@@ -223,9 +211,8 @@ def seen_beyond(dataset: Any, numbers: Tensor, misses: Tensor) -> float:
 
 
 def bright(data: dict[str, Any], chosen: Tensor) -> Tensor:
-    """Whether chosen pixels, bool [side, side] of a grid from corner to corner, of a picture show
-    something that no mask hides: bool [N]. The data are a dataset's, `image` [H, W, 3 or 4] in [0,
-    1]."""
+    """Whether chosen pixels, bool [side, side] of a grid from corner to corner, of a dataset's
+    picture show something that no mask hides: bool [N]."""
     image = data["image"]
     height, width = image.shape[:2]
     places = chosen.nonzero() / (len(chosen) - 1) * torch.tensor([height - 1, width - 1])
@@ -288,9 +275,8 @@ def detail_of(
 
 
 def _pixels_on_surface(places: Tensor, density: Tensor, size: float) -> float:
-    """The density of pixels [P], integrated over the surface on which places [P, 3] lie: as large
-    as one side of each cubic cell that it passes through, of at least `size`, and just large enough
-    for most to hold `NEIGHBOURS` places."""
+    """The density of pixels [P], integrated over the surface on which places [P, 3] lie: a side of
+    each cell that it crosses, of at least `size`, and so large that most hold `NEIGHBOURS`."""
     low = places.amin(dim=0)
     widest = max(size, float((places.amax(dim=0) - low).max()))
     while True:
@@ -304,9 +290,8 @@ def _pixels_on_surface(places: Tensor, density: Tensor, size: float) -> float:
 
 
 def _pixel_density(places: Tensor, pose: Tensor, rays: Tensor, width: int) -> Tensor:
-    """Pixels of a camera with a pose [3, 4], unit rays [K, 3] that cover its image and a width in
-    pixels, for a unit of area that faces it at places [P, 3]: one over the square of a pixel's
-    footprint, [P]; 0 outside of the image."""
+    """Pixels of a camera (pose [3, 4], unit rays [K, 3] that cover its image, width in pixels) for
+    a unit of area that faces it at places [P, 3]: [P], 0 outside of the image."""
     turn = pose[:, :3]
     local = rays @ turn
     # behind a fisheye's axis there is no tangent
