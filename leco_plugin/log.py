@@ -19,8 +19,7 @@ from torch import distributed
 from leco_plugin.models.compute.ranks import is_first
 
 SECONDS_TO_FIRST, SECONDS_A_LINE, SHARE_A_LINE = 10.0, 60.0, 0.05
-"""Before the first line where there is no terminal to draw a bar on; between two lines, seconds and
-share of the work."""
+"""To the first line without a terminal to draw a bar on, and between two lines: seconds, share."""
 OF_A_DEVICE = ("leco_plugin.samplers.kernels.fused", "leco_plugin.models.compute.grouped")
 """Whose warnings are of the device of one process; all others have the same everywhere."""
 SCREEN, WIDE = Console(highlight=False), Console(width=120)
@@ -60,8 +59,7 @@ def on_screen() -> bool:
 
 
 def console() -> Console:
-    """The short screen of a run with a log file; else nerfstudio's console where that is loaded,
-    else one as wide."""
+    """The screen of a run with a log file; else nerfstudio's console, if loaded, or one as wide."""
     if _details is not None:
         return SCREEN
     nerfstudio = sys.modules.get("nerfstudio.utils.rich_utils")

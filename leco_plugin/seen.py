@@ -24,8 +24,7 @@ RAYS_AT_ONCE = 1 << 14
 
 
 class SeenSpace(nn.Module):
-    """Which cells of the mapped cube [-1, 1]^3 training rays cross, or come near: all, before any
-    ray is noted."""
+    """Which cells of the mapped cube [-1, 1]^3 training rays cross or touch; all, until noted."""
 
     cells: Tensor
     """bool [n, n, n], n = `CELLS`."""

@@ -59,8 +59,8 @@ class SceneBounds:
     reason: str
     """One line for the log: what was seen in the data."""
     lowest: float | None = None
-    """z of the lowest sparse point, but for one in a thousand, of a scene that is photographed from
-    above and whose planes were found: what lies below is hidden by ground. None of others."""
+    """z of the lowest sparse point, but for one in a thousand, of a scene from above whose planes
+    were found by its points: what lies below is hidden. None of others."""
 
 
 def find_bounds(
@@ -109,8 +109,7 @@ def find_bounds(
 
 
 def usable_points(points: Tensor | None) -> Tensor | None:
-    """The finite ones of sparse points [P, 3], float32 on the CPU; None of fewer than
-    `FEWEST_POINTS`."""
+    """The finite ones of sparse points [P, 3], float32 on the CPU; None of too few."""
     if points is None:
         return None
     points = points.detach().float().cpu()
@@ -247,8 +246,7 @@ MOSTLY_ABOVE, MOSTLY_DOWN = 0.75, 0.9
 
 
 def _seen_from_above(poses: Tensor, directions: Tensor, points: Tensor) -> tuple[bool, str]:
-    """Whether nearly all rays go down and most cameras are above nearly all points, and both shares
-    in words."""
+    """Whether rays go down and cameras are above points as in a survey; both shares in words."""
     above = float((poses[:, 2, 3] > _quantiles(points[:, 2], 0.95)).float().mean())
     down = float(_go_down(directions).float().mean())
     words = f"{down:.0%} of rays go down, {above:.0%} of cameras are above the points"

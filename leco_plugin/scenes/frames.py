@@ -49,8 +49,7 @@ def parsed_frame(outputs: Any) -> Tensor:
 
 
 POINTS = "points3D_xyz"
-"""Key of the dataset's metadata with the sparse points [P, 3] in model coordinates, as nerfstudio's
-own readers have it."""
+"""Key of a dataset's metadata, nerfstudio's own: sparse points [P, 3] in model coordinates."""
 APPLIED = "leco_applied"
 """Key of a dataparser's metadata: `applied_transform`, or None, and `applied_scale` of its file."""
 APPLIED_EARLIER = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
@@ -226,8 +225,7 @@ point, if they are turned at all, and with the vertical, if they are level."""
 ONE_HEADING = 0.7
 """Length of the mean of the cameras' top axes: with more, all are held alike."""
 WIDE = 0.3
-"""Spread of cameras over a survey, of their height: those of somebody who stands before a wall, and
-holds all photographs alike, are closer together."""
+"""Least spread of cameras over a survey, of their height: before a wall it is less."""
 
 
 def turn_to_upright(poses: Tensor, points: Tensor | None) -> Tensor | None:
@@ -287,8 +285,7 @@ def _without_strays(points: Tensor) -> Tensor | None:
 
 
 def _spreads(places: Tensor) -> tuple[Tensor, Tensor]:
-    """Standard deviations [3] of places [N, 3] along their principal axes, least first, and the
-    axes as columns [3, 3]."""
+    """Standard deviations [3] of places [N, 3] along principal axes, least first; these [3, 3]."""
     values, axes = torch.linalg.eigh(torch.cov(places.T))
     return values.clamp(min=0.0).sqrt(), axes
 

@@ -1,5 +1,4 @@
-"""What ends a command in one line and without a traceback: input that a user can mend, and a run
-that cannot go on."""
+"""What ends a command in one line and without a traceback."""
 
 from __future__ import annotations
 
@@ -9,18 +8,13 @@ from pathlib import Path
 
 
 class InputError(ValueError):
-    """Something given to a command is wrong; the message names the cause and the remedy.
-
-    It ends `leco` with this one line and status 2, and `ns-*` commands with it and status 1.
-    """
+    """Something given to a command is wrong; the message names the cause and the remedy. It ends
+    `leco` with this one line and status 2, `ns-*` commands with status 1."""
 
 
 class TrainingStopped(RuntimeError):
-    """A run cannot go on; the message says at which step, why, and what is left of it.
-
-    `AtomicTrainer` and nerfstudio's launcher raise it. A loop of one's own can catch it; `ns-*`
-    commands end with its one line and status 1, see `studio.commands`.
-    """
+    """A run cannot go on; the message says at which step, why, and what is left of it. A loop of
+    one's own can catch it; `ns-*` commands end with its one line and status 1, see `studio.commands`."""
 
 
 ANOTHER_VERSION = (
@@ -45,8 +39,7 @@ def require_keys(values: Mapping[str, object], wanted: Iterable[str]) -> None:
 
 
 def require(holds: bool, option: str, value: object, wanted: str) -> None:
-    """InputError unless the value of an option (named without dashes) is as `wanted`, say `at least
-    1`."""
+    """InputError unless the value of an option (named without dashes) is as `wanted`."""
     if not holds:
         raise InputError(f"{option} is {value}; it must be {wanted}")
 

@@ -141,8 +141,7 @@ class ReadsNear(DataParser):
 
 
 def near_bases(kind: type[DataParser]) -> tuple[type[DataParser], ...]:
-    """Bases of a class like this one, with `ReadsNear` before the reader of its poses; the class
-    itself where that is not known."""
+    """Bases of a class like this one, with `ReadsNear` before the reader of its poses, if known."""
     for owner in kind.__mro__ if not issubclass(kind, ReadsNear) else ():
         read = vars(owner).get("_generate_dataparser_outputs")
         if SEAMS & {*getattr(getattr(read, "__code__", None), "co_names", ())}:
@@ -152,8 +151,7 @@ def near_bases(kind: type[DataParser]) -> tuple[type[DataParser], ...]:
 
 
 def rounded_by(datamanager: Any) -> str | None:
-    """A line on the large coordinates that a data manager's reader has rounded; None if it has not,
-    as one with a float64 `dataparser_transform`."""
+    """A line on large coordinates that a data manager's reader has rounded; None if it has not."""
     outputs = getattr(datamanager, "train_dataparser_outputs", None)
     if outputs is None or not 0.0 < float(outputs.dataparser_scale) < np.inf:
         return None

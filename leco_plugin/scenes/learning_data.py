@@ -134,8 +134,7 @@ class LearningData:
         return held_out_rays(mixture, self.manager, count, seed, share)
 
     def training_rays(self, mixture: Mixture, count: int, set_aside: int = 0) -> Rays:
-        """Rays of random training pixels, cut to a mixture's region; those of whole batches.
-        `set_aside` as of `prepare_batch`, and for this draw only."""
+        """Rays of random training pixels, cut to a region; `set_aside` is for this draw only."""
         self.prepare_batch(1.0, distances=False, set_aside=set_aside)
         drawn: list[Rays] = []
         for bundle in training_bundles(self.manager, count):

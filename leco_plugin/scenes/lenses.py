@@ -52,8 +52,7 @@ class Lens:
     def focal_lengths(
         self, width: float, height: float, factor: int
     ) -> tuple[float, float] | tuple[None, None]:
-        """Both focal lengths in pixels of a picture of that size, smaller by `factor` than the lens
-        is for; None where nothing is said."""
+        """Focal lengths in pixels of a picture, smaller by `factor` than the lens, if known."""
         across = self.fx, self.angle_x, width if self.width is None else self.width / factor
         down = self.fy, self.angle_y, height if self.height is None else self.height / factor
         found = [
@@ -65,8 +64,7 @@ class Lens:
 
 
 def lens_of(meta: dict[str, Any], frame: dict[str, Any], where: str) -> Lens:
-    """The lens of a frame, which goes before what the scene says. InputError, with `where` that is,
-    for a number that is none or a lens that is not nerfstudio's."""
+    """The lens of a frame, or else of its scene. InputError, with `where` that is, for no lens."""
 
     def said(name: str, positive: bool = True) -> float | None:
         value = frame.get(name, meta.get(name))

@@ -1,8 +1,7 @@
 """The files of photographs and of their masks: there, whole, and such as nerfstudio reads rightly.
 
-nerfstudio takes the numbers of a palette for greys and the low bytes of 16 bits for all of them,
-turns no photograph as its EXIF says, and a file that is cut off ends it in the middle of loading.
-Of a mask, each pixel that is not 0 counts as seen.
+nerfstudio reads numbers of a palette as greys, the low bytes of 16 bits, no EXIF, every pixel of a
+mask that is not 0 as seen, and fails in the middle of loading at a file that is cut off.
 """
 
 from __future__ import annotations
@@ -154,8 +153,7 @@ def is_turned(header: Header, size: tuple[int, int]) -> bool:
 
 
 def decode(path: Path, turn: bool) -> Image.Image:
-    """The plain colours of an image, with its EXIF, turned as that says if asked. InputError if it
-    has none."""
+    """The plain colours and the EXIF of an image, turned as that says if asked; or InputError."""
     try:
         with opened(path) as image:
             image.load()  # Pillow itself turns TIFF here
@@ -301,8 +299,7 @@ def _found(path: Path, image: Path) -> Path:
 
 
 def _values(path: Path) -> NDArray[np.uint8]:
-    """How light each pixel of a mask is: [H, W] from 0 to 255, transparent ones 0. InputError if it
-    cannot be read, or has colours."""
+    """How light each pixel of a mask is: [H, W], 0 to 255, transparent ones 0; or InputError."""
     try:
         with Image.open(path) as image:
             if image.mode in ("1", "L") and "transparency" not in image.info:
@@ -329,8 +326,7 @@ def _is_seen(values: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 
 def _fit(seen: NDArray[np.bool_], size: tuple[int, int], path: Path) -> NDArray[np.bool_]:
-    """The pixels of a mask of its image's size, or of a whole number of times that. InputError if
-    it has another size."""
+    """The pixels of a mask that has its image's size, or a multiple; else InputError."""
     high, wide = seen.shape
     if (wide, high) == size:
         return seen

@@ -23,8 +23,7 @@ class Refused(Exception):
 
 
 def read_pt(path: Path, most_bytes: int = 1 << 20) -> Any:
-    """What a .pt file holds. InputError if it cannot be read, is damaged or too large, or holds
-    anything but tensors, numbers, strings and containers of them."""
+    """What a .pt file holds: tensors, numbers, strings, containers of them. Else InputError."""
     return load(read_bytes(path, most_bytes), str(path))
 
 

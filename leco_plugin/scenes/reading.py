@@ -53,8 +53,7 @@ UNWRITABLE = "make the folder of the scene writable, or convert its pictures and
 
 
 class CheckedReader(DataParser):
-    """Stands before a reader among the bases of a class: its outputs are checked, and each of its
-    errors is one line."""
+    """Stands before a reader among the bases of a class: checks outputs, errors are one line."""
 
     def __init__(self, config: base_dataparser.DataParserConfig) -> None:
         super().__init__(config)
@@ -236,8 +235,7 @@ def _check_focal_lengths(cameras: Cameras, images: list[Path]) -> None:
 def _size_of(
     path: Path, header: Header, lens: Lens | None, wanted: list[int], factor: int
 ) -> tuple[int, int]:
-    """Width and height of a picture as it will be read. InputError unless they are those of its
-    lens or, without one, those `wanted` for its camera."""
+    """Width and height of a picture as it will be read. InputError unless its lens has them."""
     slack = 1
     if lens is not None and lens.width is not None and lens.height is not None:
         wanted = [int(lens.width) // factor, int(lens.height) // factor]

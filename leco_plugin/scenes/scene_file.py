@@ -62,8 +62,7 @@ def file_in(data: Path) -> Path:
 
 
 def load_json(path: Path) -> Any:
-    """What a JSON file says, with or without a byte order mark; nulls are left out, and poses
-    of three rows have the fourth."""
+    """What a JSON file says, without nulls, poses completed to four rows."""
     said = _parsed(path.read_bytes())
     if not isinstance(said, dict):
         return said
@@ -178,8 +177,7 @@ def _add(scene: SceneFile, data: Path) -> str:
 
 
 def frames_of(images: list[Path], scene: SceneFile) -> list[int | None]:
-    """The number of the frame of each picture, which may be a smaller one of the same name.
-    InputError if frames of different folders would have one smaller picture."""
+    """The number of each picture's frame. InputError if frames of several folders share one."""
     places = [str(frame["file_path"]).replace("\\", "/") for frame in scene.frames]
     named: dict[str, list[int]] = {}
     for number, place in enumerate(places):
@@ -202,7 +200,7 @@ def factors_of(
     scene: SceneFile, numbers: list[int | None], config: Any, cameras: Cameras
 ) -> list[int]:
     """By which whole number a reader has made each camera smaller than its lens says: nerfstudio's
-    own by one factor for the scene, Blender's by the size of the first picture, others by none."""
+    own for the scene, Blender's by its first picture, others not."""
     known = [(row, number) for row, number in enumerate(numbers) if number is not None]
     if not known or not (hasattr(config, "downscale_factor") or hasattr(config, "alpha_color")):
         return [1] * len(numbers)
@@ -226,8 +224,7 @@ NEEDLESS = {
     *("geographic_origin", "importance_sampling", "integer_depth_scale", "n_extra_learnable_dims"),
     *("offset", "render_aabb", "scale", "sharpness", "timestamp"),
 }
-"""Neither geometry nor colour depends on them: our bounds come from cameras and points, and our
-methods learn without depths."""
+"""Neither geometry nor colour depends on them: bounds come from cameras and points."""
 
 
 def unused_fields(meta: dict[str, Any]) -> list[str]:

@@ -29,8 +29,7 @@ SIDE = 8
 """A grid of this many rays a side covers each image, its corners included."""
 MOST_CAMERAS = 256
 WORTH_IT = 0.005
-"""Share of all rays that must go beyond a scene photographed from above and show something there
-for its bounds to be raised."""
+"""Share of all rays that must show something beyond a survey from the air, to raise its bounds."""
 MOST_PICTURES = 16
 """Pictures that are opened to see what lies beyond: those with the most rays that miss."""
 
@@ -126,9 +125,8 @@ def survey(
     near: float | None = None,
     far: float | None = None,
 ) -> Survey:
-    """Looks at the training cameras of any nerfstudio data manager; near and far, scene units, are
-    found from the data where they are None. InputError if there are no cameras, no ray meets the
-    scene, or what is configured is no range."""
+    """Looks at the training cameras of a nerfstudio data manager; near and far, scene units, are
+    found where they are None. InputError if no ray meets the scene, or what is configured is no range."""
     if hasattr(datamanager, "train_unseen_cameras"):
         kind = type(datamanager).__name__
         raise InputError(
@@ -211,8 +209,7 @@ def seen_beyond(dataset: Any, numbers: Tensor, misses: Tensor) -> float:
 
 
 def bright(data: dict[str, Any], chosen: Tensor) -> Tensor:
-    """Whether chosen pixels, bool [side, side] of a grid from corner to corner, of a dataset's
-    picture show something that no mask hides: bool [N]."""
+    """Whether chosen pixels, bool [side, side] of a grid over a picture, show a thing: bool [N]."""
     image = data["image"]
     height, width = image.shape[:2]
     places = chosen.nonzero() / (len(chosen) - 1) * torch.tensor([height - 1, width - 1])
@@ -241,8 +238,7 @@ class SceneDetail:
     texels: float
     """Footprints that cover the scene's surface; no more than there are pixels."""
     across: float
-    """Footprints (the ground sampling distance, median over the scene) along the cube that is
-    encoded."""
+    """Footprints (ground sampling distance, median) along the cube that is encoded."""
 
 
 def detail_of(

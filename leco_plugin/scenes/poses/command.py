@@ -37,8 +37,7 @@ FORMAT, DESCRIPTION = 2, "transforms.json"
 GPS, BEFORE = "gps", "transforms.before_gps.json"
 """What of it says the photographs' GPS; and transforms.json as it was, where that was mended."""
 GROWTH = 3
-"""Bytes of a copy that is written anew, at most, over those of its original: 1.7 to 2.1 were seen
-of JPEG."""
+"""Bytes of a copy that is written anew over those of its original: of JPEG 1.7 to 2.1 were seen."""
 WRONG = 50.0
 """Metres from its pose beyond which a position by GPS is no scatter: its photograph is named."""
 FEW_PLACED = 0.8
@@ -121,8 +120,7 @@ def _read(file: Path) -> dict[str, Any] | None:
 
 
 def _finished(out: Path, asked: dict[str, Any]) -> dict[str, Any] | None:
-    """The report of a scene that is finished; None of one that is to be made or to go on.
-    InputError if the folder holds something else."""
+    """The report of a finished scene, or None. InputError if the folder holds something else."""
     found = _read(out / ASKED)
     if found is None:
         if out.exists() and (not out.is_dir() or {each.name for each in out.iterdir()} - {LOCK}):

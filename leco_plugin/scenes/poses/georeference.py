@@ -89,9 +89,8 @@ def place(
 ) -> Placement:
     """The similarity that takes a reconstruction to metres, or a rotation that sets it upright.
 
-    Of camera centres [C, 3] with positions by GPS [C, 3] in metres, nan where not known, and what
-    is up [3]. The mean `top` [3] of the photographs' top edges has a word where GPS would turn that
-    upside down.
+    Of camera centres [C, 3] with positions by GPS [C, 3] in metres, or nan, and what is up [3]; the
+    mean `top` [3] of photographs has a word where GPS would turn it upside down.
     """
     there = np.isfinite(gps).all(axis=1)
     known, count = gps[there], int(there.sum())
@@ -124,9 +123,8 @@ def place(
 
 
 def _is_mirrored(turn: Array, places: Array, up: Array, top: Array | None, width: float) -> bool:
-    """Whether a turn [3, 3] to places [N, 3] by GPS, about `width` metres off, puts what is up [3]
-    down: places in a plane fit as well from below. Tops [3] that point up afterwards tell of
-    cameras that look up."""
+    """Whether a turn [3, 3] to places [N, 3] in a plane, `width` metres off, puts what is up [3]
+    down, and no mean top [3] that points up afterwards tells of cameras that look up."""
     away = places - places.mean(axis=0)
     spread = np.linalg.svd(away, compute_uv=False) / np.sqrt(len(places))
     lies_in_a_plane = spread[1] > width > spread[2]
@@ -140,8 +138,8 @@ def tolerance(spread: float) -> float:
 
 
 def roll_upright(turn: Array, places: Array, up: Array, width: float) -> Array:
-    """A rotation [3, 3], rolled about the line of flight so that `up` goes up: places [N, 3] on a
-    line say nothing of that roll. It stays for places wider than `width` metres across."""
+    """A rotation [3, 3] to places [N, 3], rolled about their line so that `up` goes up; the same if
+    they are wider than `width` metres across."""
     _, lengths, axes = np.linalg.svd(places - places.mean(axis=0), full_matrices=False)
     if lengths[1] / np.sqrt(len(places)) > width:
         return turn

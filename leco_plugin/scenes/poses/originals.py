@@ -125,8 +125,7 @@ KINDS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", *HEIC)
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf")
 FILMS = (".mp4", ".mov", ".avi", ".mkv", ".m4v")
 COPIED = {"JPEG": (".jpg", ".jpeg"), "MPO": (".jpg", ".jpeg"), "PNG": (".png",)}
-"""Kinds, by Pillow's name, that are copied byte by byte where their colours need no change and
-their names end so: pycolmap reads no other."""
+"""Pillow's names of kinds, and endings, of files that are copied where colours need no change."""
 SCAN, DESCRIPTIONS = 0xDA, (*range(0xE0, 0xF0), 0xFE)
 """Markers in a JPEG: where pixels begin, and segments of applications, EXIF's, and comments."""
 FEWEST = 3
@@ -156,8 +155,7 @@ class Photograph:
 
     @property
     def content(self) -> tuple[object, ...]:
-        """What tells whether it is the same picture: name, bytes without EXIF, and of EXIF what its
-        copy and lens depend on."""
+        """The same of the same picture with the same lens, whatever its GPS."""
         length = self.path.stat().st_size - described_bytes(self.path)
         return self.name, length, self.size, self.header.orientation, self.exif[2:]
 
@@ -198,8 +196,7 @@ class Found(NamedTuple):
 
 
 def find_photographs(folder: Path, out: Path) -> Found:
-    """The photographs in a folder and below it, by name, but for what lies in `out`. InputError if
-    there is no such folder, or it has fewer than three that can be used."""
+    """The photographs below a folder, but for `out`, by name. InputError for fewer than three."""
     if not folder.is_dir():
         raise InputError(f"there is no folder {folder}: give the one with the photographs")
     if folder.is_relative_to(out):
@@ -238,8 +235,7 @@ def find_photographs(folder: Path, out: Path) -> Found:
 
 
 def _files_below(folder: Path, out: Path) -> list[Path]:
-    """Files in a folder and below it, by name, each folder once, but for what is hidden or lies in
-    `out`."""
+    """Files in a folder and below it, by name, each folder once; none hidden, and none in `out`."""
     found: list[Path] = []
     known = set()
     starts = [folder]  # linked folders follow, so that a folder is known by its own name first
@@ -305,9 +301,8 @@ def _header(path: Path) -> Header:
 
 
 def copy_photographs(found: Found, folder: Path, show: Callable[[float], None]) -> Found:
-    """Writes copies that are not there yet; `show` takes the share done. Returns what was found
-    without what cannot be decoded. InputError if fewer than three are left, or a copy cannot be
-    written."""
+    """Writes the copies that are missing; `show` takes the share done. Returns what was found
+    without what cannot be decoded. InputError as `_enough`, or if a copy cannot be written."""
     photographs, refused = [], dict(found.refused)
     for number, photograph in enumerate(found.photographs):
         copy = folder / photograph.name
@@ -335,8 +330,7 @@ def _write(photograph: Photograph, image: Image.Image, path: Path) -> None:
 
 
 def _upright_exif(image: Image.Image, kind: str) -> bytes:
-    """EXIF of an image that has been turned upright: only that where the rest cannot be written, or
-    is too long for a JPEG."""
+    """EXIF of an image that has been turned upright; only that, if more cannot be written."""
     upright = Image.Exif()
     upright[ExifTags.Base.Orientation] = 1
     try:

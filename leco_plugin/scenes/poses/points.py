@@ -41,8 +41,7 @@ TOLERANCE = 0.01
 BYTES_A_SQUARE = 2.0
 """Of a copy as PNG, over the square of its longest side: four scenes took 0.9 to 1.2."""
 CONTRADICTED = 0.5
-"""Share of the matched features that must agree with the poses: 94% do in a scene of nine
-photographs, 12 to 15% where their poses are shuffled."""
+"""Share of matched features that must agree with poses: 94% in a scene, 15% of shuffled poses."""
 
 
 def find_points(data: Path, size: int = 1600, threads: int = 0) -> dict[str, Any]:
@@ -92,8 +91,7 @@ def training_frames(scene: SceneFile) -> list[int]:
 
 
 def _triangulate(reconstructor: Reconstructor, cameras: Sequence[Any], poses: Array) -> Any:
-    """A model of pycolmap with points, from features and given OpenGL poses [C, 3, 4] with cameras
-    [C]."""
+    """A model of pycolmap with points, of given OpenGL poses [C, 3, 4] with cameras [C]."""
     pycolmap, work = reconstructor.pycolmap, reconstructor.folder / "triangulated"
     given = pycolmap.Reconstruction()
     with pycolmap.Database.open(reconstructor.database) as database:

@@ -63,8 +63,7 @@ class Reconstructor:
         self.photographs, self.threads = photographs, threads
 
     def extract(self, lens: Lens, size: int) -> None:
-        """Finds features in the photographs that have none in the database, made smaller to a
-        longest side of `size` pixels."""
+        """Finds features, at a longest side of `size` pixels, in photographs that have none yet."""
         pycolmap = self.pycolmap
         self._enter(lens)
         options = pycolmap.FeatureExtractionOptions()
@@ -130,8 +129,7 @@ class Reconstructor:
                 show(at / count)
 
     def map(self) -> list[Any]:
-        """COLMAP's models, that with the most photographs first. InputError if no photographs
-        overlap."""
+        """COLMAP's models, the largest first. InputError if no photographs overlap."""
         pycolmap, folder = self.pycolmap, self.scene / MODELS
         whole = folder / "all"
         if not whole.exists():
@@ -203,8 +201,7 @@ NEIGHBOURS = 16
 WIDE = 20.0
 """Metres from their middle, in the median, from which on positions tell who sees the same."""
 ASTRAY = 0.7
-"""Median distance of one photograph to the next in order, as a multiple of that of any two, from
-which on order and GPS contradict each other."""
+"""Median distance of next ones, over that of any two, from which on GPS contradicts order."""
 NEXT = 10
 """Photographs in order that each is compared with, and one at each power of two beyond."""
 ANCHORS = 100
@@ -288,8 +285,8 @@ def capture_order(names: Sequence[str], exifs: Sequence[Exif]) -> list[int] | No
 def _near(
     places: NDArray[np.float64], ranks: NDArray[np.int64], ahead: NDArray[np.float64] | None = None
 ) -> set[tuple[int, int]]:
-    """Pairs of each photograph with others near to its place [N, 2 or 3], by `ranks` of distance,
-    but for those that look another way, [N, 3] if given."""
+    """Pairs of each photograph with those near to its place [N, 2 or 3], by `ranks` of distance,
+    that look its way, [N, 3] if given."""
     found = set()
     for row in range(len(places)):
         distances = ((places - places[row]) ** 2).sum(axis=1)
