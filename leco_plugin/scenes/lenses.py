@@ -80,13 +80,13 @@ def lens_of(meta: dict[str, Any], frame: dict[str, Any], where: str) -> Lens:
     return Lens(kind, fx, fy, cx, cy, width, height, distortion, angle_x, angle_y, radius)
 
 
-def set_lenses(cameras: Cameras, lenses: list[Lens | None], factors: list[int]) -> None:
+def set_lenses(cameras: Cameras, lenses: list[Lens | None], factor: int) -> None:
     """Gives each camera of the pictures' sizes its lens, in place; of None it keeps its own.
-    Pictures are smaller by `factors` than lenses are for."""
+    Pictures are smaller by `factor` than lenses are for."""
     for name in ("fx", "fy", "cx", "cy", "camera_type", "distortion_params"):
         if (shared := getattr(cameras, name)) is not None:  # by all, where they had one value
             setattr(cameras, name, shared.expand(len(lenses), -1).clone())
-    for number, (lens, factor) in enumerate(zip(lenses, factors)):
+    for number, lens in enumerate(lenses):
         if lens is None:
             continue
         size = float(cameras.width[number]), float(cameras.height[number])

@@ -6,7 +6,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -197,21 +197,11 @@ TRAINED = 0.5
 """Least share of the cameras that is still trained on."""
 
 
-class Stretch(NamedTuple):
-    """Which cameras are held out, and which are neither tested nor trained on."""
-
-    held_out: list[int]
-    beside: list[int]
-
-
-def find_stretch(positions: Array) -> Stretch:
-    """The stretch of cameras at [C, 3] near the middle that ends with the widest gap, by number.
-
-    It grows by the nearest camera each time, and so follows a line or an arc. ValueError if there
-    are too few cameras, or they stand too close together.
-    """
-    count = len(positions)
-    if count < FEWEST:
+def find_stretch(positions: Array) -> tuple[list[int], list[int]]:
+    """The stretch of cameras at [C, 3] near the middle that ends with the widest gap, and those
+    beside it, by number. It grows by the nearest camera each time, and so follows a line or an arc.
+    ValueError if there are too few cameras, or they stand too close together."""
+    if (count := len(positions)) < FEWEST:
         raise ValueError(f"there are {count} cameras: a stretch is held out of {FEWEST} or more")
     order, gaps = _grow(positions)
     low, high = max(2, round(LEAST * count)), round(MOST * count)
@@ -229,7 +219,7 @@ def find_stretch(positions: Array) -> Stretch:
             f"beside a stretch of {size} of {count} cameras there are {len(beside)} others, too "
             "many to leave them out of training"
         )
-    return Stretch(sorted(held_out.tolist()), sorted(beside.tolist()))
+    return sorted(held_out.tolist()), sorted(beside.tolist())
 
 
 def _grow(positions: Array) -> tuple[NDArray[np.int64], Array]:
@@ -250,10 +240,10 @@ def stretch_of(meta: dict[str, Any], scene: str) -> dict[str, list[str]]:
     they stand next to the tested ones. InputError, with `scene`, if no stretch can be held out."""
     poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], dtype=float)
     try:
-        found = find_stretch(poses[:, :3, 3])
+        held_out, beside = find_stretch(poses[:, :3, 3])
     except ValueError as error:
         raise InputError(f"{scene}: {error}; hold out photographs of the spread instead") from None
-    kinds = dict.fromkeys(found.held_out, "test") | dict.fromkeys(found.beside, "beside")
+    kinds = dict.fromkeys(held_out, "test") | dict.fromkeys(beside, "beside")
     names: dict[str, list[str]] = {"train": [], "test": [], "beside": []}
     for number, frame in enumerate(meta["frames"]):
         names[kinds.get(number, "train")].append(str(frame["file_path"]))

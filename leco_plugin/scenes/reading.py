@@ -18,34 +18,13 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOu
 from PIL import UnidentifiedImageError
 
 from leco_plugin.log import bar, say, say_all
+from leco_plugin.scenes import photograph_files, scene_file
 from leco_plugin.scenes.frames import check_poses
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.large_coordinates import near_bases
 from leco_plugin.scenes.lenses import Lens, set_lenses
-from leco_plugin.scenes.photograph_files import (
-    SAVE_ANEW,
-    DerivedImages,
-    Header,
-    check_kind,
-    convert_masks,
-    decode,
-    header_of,
-    is_plain,
-    is_turned,
-)
-from leco_plugin.scenes.scene_file import (
-    READERS,
-    SceneFile,
-    command_with,
-    description_of,
-    factors_of,
-    frames_of,
-    has_model,
-    own_target,
-    remedy_for,
-    say_unused,
-    scene_file_of,
-)
+from leco_plugin.scenes.photograph_files import DerivedImages, Header, decode, header_of, is_plain
+from leco_plugin.scenes.scene_file import SceneFile, command_with, description_of
 from leco_plugin.studio.checkpoints import require_data
 
 SAVE_ALIKE = "save all with an alpha channel or none"
@@ -64,7 +43,7 @@ class CheckedReader(DataParser):
         """As the reader's. InputError, in one line, for whatever goes wrong."""
         config: Any = self.config
         require_data(Path(config.data))
-        scene = scene_file_of(config, split)
+        scene = scene_file.scene_file_of(config, split)
         try:
             read = super().get_dataparser_outputs(split=split, **options)
             outputs = checked(read, config, split, scene)
@@ -107,7 +86,7 @@ def read_checked(parser: Any) -> Any:
 
 def set_up_checked(config: Any, **options: Any) -> Any:
     """What a config of `with_checks` sets up: its own reader, checked."""
-    return checked_class(own_target(config))(config, **options)
+    return checked_class(scene_file.own_target(config))(config, **options)
 
 
 def with_checks(config: Any) -> Any:
@@ -137,7 +116,7 @@ def _remedy(error: BaseException, config: Any) -> str:
     data, name = Path(config.data), reader_name(config)
     if not data.exists():
         return "there is no such folder: put it, or a link, there, or give another with --data"
-    if _lacks_its_file(error, config) and (other := remedy_for(data)):
+    if _lacks_its_file(error, config) and (other := scene_file.remedy_for(data)):
         return other
     if isinstance(error, EOFError | SystemExit):
         if name != "colmap":
@@ -152,7 +131,7 @@ def _remedy(error: BaseException, config: Any) -> str:
     if "\\" in str(error).replace("\\\\", "\\"):
         return "its names were written by Windows: write / for each backslash"
     if isinstance(error, UnidentifiedImageError):
-        return SAVE_ANEW
+        return photograph_files.SAVE_ANEW
     if isinstance(error, FileNotFoundError | NotADirectoryError):
         return "put that file there, or remove what names it"
     file = description_of(config, "train") or data
@@ -167,8 +146,8 @@ def _lacks_its_file(error: BaseException, config: Any) -> bool:
         return False  # it has been read
     data, name = Path(config.data), reader_name(config)
     if hasattr(config, "colmap_path"):
-        return not has_model(data / config.colmap_path)
-    signs = [sign for sign, reader in READERS.items() if reader == name]
+        return not scene_file.has_model(data / config.colmap_path)
+    signs = [sign for sign, reader in scene_file.READERS.items() if reader == name]
     if signs:
         return not (data / signs[0]).is_file()
     return isinstance(error, FileNotFoundError | NotADirectoryError) or "exist" in str(error)
@@ -187,7 +166,7 @@ def checked(
     folder = data if data.is_dir() else data.parent
     derived = DerivedImages(folder / "leco-cache" / "pictures", UNWRITABLE)
     images = [Path(path) for path in outputs.image_filenames]
-    cameras, factors = outputs.cameras, [1] * len(images)
+    cameras, factor = outputs.cameras, 1
     if cameras.camera_to_worlds.shape != (len(images), 3, 4):
         raise InputError(  # as nerfstudio's reader of instant-ngp makes them of one photograph
             f"{data}: {reader_name(config)} makes no cameras of {len(images)} photographs of the "
@@ -198,26 +177,27 @@ def checked(
     headers = [header_of(path) for path in images]
     lenses: list[Lens | None] = [None] * len(images)
     if scene is not None:
-        numbers = frames_of(images, scene)
+        numbers = scene_file.frames_of(images, scene)
         lenses = [None if number is None else scene.lenses[number] for number in numbers]
-        factors = factors_of(scene, numbers, config, cameras)
+        factor = scene_file.factor_of(scene, numbers, config, cameras)
         masks = [None if n is None else scene.frames[n].get("mask_path") for n in numbers]
         unread = outputs.mask_filenames is None and not hasattr(config, "masks_dir")
         if unread and all(masks):
             outputs.mask_filenames = [scene.mask(str(path)) for path in masks]
         if speak:
-            say_unused(scene.meta, scene.path)
+            scene_file.say_unused(scene.meta, scene.path)
     made = torch.cat([cameras.width, cameras.height], dim=-1).expand(len(images), -1).tolist()
-    sizes = [_size_of(*each) for each in zip(images, headers, lenses, made, factors)]
+    sizes = [_size_of(*each, factor) for each in zip(images, headers, lenses, made)]
     cameras.width, cameras.height = torch.tensor(sizes).to(cameras.width).split(1, dim=1)
-    set_lenses(cameras, lenses, factors)
+    set_lenses(cameras, lenses, factor)
     _check_focal_lengths(cameras, images)
-    turns = [is_turned(header, size) for header, size in zip(headers, sizes)]
+    turns = [photograph_files.is_turned(header, size) for header, size in zip(headers, sizes)]
     outputs.image_filenames, lines = _plain_pictures(images, headers, turns, derived)
     say_all(lines if speak else ())
     if outputs.mask_filenames is not None:
-        paths = [Path(path) for path in outputs.mask_filenames]
-        outputs.mask_filenames = convert_masks(paths, images, sizes, derived, speak)
+        masks = [Path(path) for path in outputs.mask_filenames]
+        masks = photograph_files.convert_masks(masks, images, sizes, derived, speak)
+        outputs.mask_filenames = masks
     elif speak and getattr(config, "masks_path", False) is None and (data / "masks").is_dir():
         say(f"{data / 'masks'} is not used: `--masks-path masks` would")
     return outputs
@@ -259,7 +239,7 @@ def _plain_pictures(
     needed = any(turns) or not all(is_plain(header) for header in headers)
     with bar("Converting photographs") if needed else nullcontext(lambda share: None) as progress:
         for path, header, turn in zip(images, headers, turns):
-            check_kind(path, header)
+            photograph_files.check_kind(path, header)
             if header.orientation != 1 and not turn:
                 as_stored.append(path)
             if is_plain(header) and not turn:

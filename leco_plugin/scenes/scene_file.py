@@ -196,19 +196,16 @@ def frames_of(images: list[Path], scene: SceneFile) -> list[int | None]:
     return found
 
 
-def factors_of(
-    scene: SceneFile, numbers: list[int | None], config: Any, cameras: Cameras
-) -> list[int]:
-    """By which whole number a reader has made each camera smaller than its lens says: nerfstudio's
-    own for the scene, Blender's by its first picture, others not."""
+def factor_of(scene: SceneFile, numbers: list[int | None], config: Any, cameras: Cameras) -> int:
+    """By which whole number a reader has made cameras smaller than their lenses say: nerfstudio's
+    own by the width of the scene, Blender's by that of its first picture, others not."""
     known = [(row, number) for row, number in enumerate(numbers) if number is not None]
     if not known or not (hasattr(config, "downscale_factor") or hasattr(config, "alpha_color")):
-        return [1] * len(numbers)
+        return 1
     row, number = known[0]
     full = scene.meta.get("w") if hasattr(config, "downscale_factor") else None
     full = scene.lenses[number].width if full is None else full
-    factor = 1 if full is None else max(1, round(float(full) / int(cameras.width[row])))
-    return [factor] * len(numbers)
+    return 1 if full is None else max(1, round(float(full) / int(cameras.width[row])))
 
 
 READ = LENS_FIELDS | {
@@ -315,20 +312,13 @@ def _images_option(folder: Path) -> str:
     return "" if place is None else f" --images-path {shlex.quote(str(place.relative_to(folder)))}"
 
 
-def _is_of(path: Path, mark: bytes | None) -> bool:
-    """Whether a file is of the program that its name tells of, by what it holds."""
-    if mark is None:
-        return True
-    with path.open("rb") as file:
-        return mark in file.read(200)
-
-
 def _converter_for(data: Path) -> str | None:
     """The command that makes a scene of a folder; None where none is known."""
     if not data.is_dir():
         return None
     for sign, kind in CONVERTERS.items():
-        if any(_is_of(path, BEGIN_WITH.get(sign)) for path in data.glob(sign)):
+        mark = BEGIN_WITH.get(sign)
+        if any(mark is None or mark in path.read_bytes()[:200] for path in data.glob(sign)):
             source = data / "images" if sign == "images" else data
             command, *options = kind.split()
             place = next((each for each in COLMAP if (data / each / "cameras.bin").is_file()), None)

@@ -126,7 +126,7 @@ def survey(
     far: float | None = None,
 ) -> Survey:
     """Looks at the training cameras of a nerfstudio data manager; near and far, scene units, are
-    found where they are None. InputError if no ray meets the scene, or what is configured is no range."""
+    found where they are None. InputError if no ray meets the scene, or for a wrong range."""
     if hasattr(datamanager, "train_unseen_cameras"):
         kind = type(datamanager).__name__
         raise InputError(

@@ -97,8 +97,8 @@ def make_scene(
             "pairs_by": chosen.reason,
             "seconds": round(time.monotonic() - began, 1),
         }
-        meta = world.transforms_of(models[0], placement, origin)
-        world.write_scene(out, models[0], meta, report, REPORT)
+        write_json(out / REPORT, report, indent=1)
+        world.write_scene(out, models[0], world.transforms_of(models[0], placement, origin))
     return report
 
 

@@ -222,16 +222,13 @@ def intrinsics(camera: Any) -> dict[str, float]:
     return {"w": camera.width, "h": camera.height, **found}
 
 
-def write_scene(
-    scene: Path, model: Any, meta: dict[str, Any], report: dict[str, Any], report_name: str
-) -> None:
-    """Writes points, COLMAP's model, the report and, last of all, transforms.json."""
+def write_scene(scene: Path, model: Any, meta: dict[str, Any]) -> None:
+    """Writes points, COLMAP's model and, last of all, transforms.json."""
     folder = scene / MODEL
     folder.mkdir(parents=True, exist_ok=True)
     model.write(folder)
     write_sparse_points(scene / POINTS, *points_of(model))
-    for name, said in ((report_name, report), ("transforms.json", meta)):
-        write_json(scene / name, said, indent=1)
+    write_json(scene / "transforms.json", meta, indent=1)
 
 
 def write_sparse_points(path: Path, places: Array, colours: NDArray[np.uint8]) -> None:

@@ -162,7 +162,7 @@ class Photograph:
     @property
     def lens(self) -> tuple[object, ...]:
         """The same of photographs that share their intrinsics."""
-        return (self.size, self.exif.camera)
+        return self.size, self.exif.camera
 
     @property
     def is_copied(self) -> bool:
@@ -277,7 +277,13 @@ def _read(path: Path, folder: Path) -> Photograph:
     """One photograph, its pixels not decoded yet. InputError if it is of no kind that is used."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # damaged EXIF counts as not there
-        header = _header(path)
+        try:
+            header = header_of(path)
+        except InputError:
+            if path.suffix.lower() not in HEIC or sys.modules.get("pillow_heif"):
+                raise
+            remedy = "`pip install pillow-heif` reads it, or save it as JPEG"
+            raise InputError(f"{path} is HEIC: {remedy}") from None
         check_kind(path, header)
         with Image.open(path) as image:
             exif = read_exif(image)
@@ -288,16 +294,6 @@ def _read(path: Path, folder: Path) -> Photograph:
         return photograph
     ending = ".jpg" if suffix in HEIC and not header.transparent else ".png"
     return replace(photograph, name=name if name.endswith(ending) else name + ending)
-
-
-def _header(path: Path) -> Header:
-    """What a file says, whatever its name ends in. InputError if it cannot be read."""
-    try:
-        return header_of(path)
-    except InputError:
-        if path.suffix.lower() not in HEIC or sys.modules.get("pillow_heif"):
-            raise
-    raise InputError(f"{path} is HEIC: `pip install pillow-heif` reads it, or save it as JPEG")
 
 
 def copy_photographs(found: Found, folder: Path, show: Callable[[float], None]) -> Found:
@@ -320,11 +316,11 @@ def _write(photograph: Photograph, image: Image.Image, path: Path) -> None:
         if photograph.is_copied:
             with photograph.path.open("rb") as source:
                 write_whole(path, lambda file: shutil.copyfileobj(source, file))
-        else:
-            kind = "PNG" if path.suffix.lower() == ".png" else "JPEG"
-            exif = _upright_exif(image, kind)
-            options = {} if kind == "PNG" else {"quality": QUALITY, "subsampling": 0}
-            write_whole(path, lambda file: image.save(file, kind, exif=exif, **options))
+            return
+        kind = "PNG" if path.suffix.lower() == ".png" else "JPEG"
+        options: dict[str, Any] = {"exif": _upright_exif(image, kind)}
+        options |= {} if kind == "PNG" else {"quality": QUALITY, "subsampling": 0}
+        write_whole(path, lambda file: image.save(file, kind, **options))
     except OSError as error:
         raise InputError(f"{path} cannot be written: {one_line(error, 120)}") from None
 
@@ -333,10 +329,9 @@ def _upright_exif(image: Image.Image, kind: str) -> bytes:
     """EXIF of an image that has been turned upright; only that, if more cannot be written."""
     upright = Image.Exif()
     upright[ExifTags.Base.Orientation] = 1
-    try:
+    with suppress(Exception):  # tags of another type than the standard's raise many errors
         exif = image.getexif()
         exif[ExifTags.Base.Orientation] = 1
-        said = exif.tobytes()
-    except Exception:  # noqa: BLE001  tags of another type than the standard's raise many errors
-        return upright.tobytes()
-    return upright.tobytes() if kind == "JPEG" and len(said) > MOST_EXIF else said
+        if kind == "PNG" or len(exif.tobytes()) <= MOST_EXIF:
+            return exif.tobytes()
+    return upright.tobytes()

@@ -120,7 +120,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
         Image.new("RGB", (32, 24), (90, 80, number)).save(tmp_path / "images" / f"{number}.png")
     model = StandIn()
     meta = transforms_of(model, IN_METRES, (41.0, -83.0, 0.0))
-    write_scene(tmp_path, model, meta, {"format": 1}, "poses.json")
+    write_scene(tmp_path, model, meta)
     assert json.loads((tmp_path / "poses.json").read_text()) == {"format": 1}
     points = np.array([point.xyz for point in model.points3D.values()])
     np.testing.assert_allclose(read_ply(tmp_path / "sparse_pc.ply"), points, atol=1e-6)
