@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -18,10 +17,8 @@ if TYPE_CHECKING:
 def occupancy_of(path: Path) -> Path:
     """The file that is meant: itself, or the newest occupancy in a folder of runs. ValueError if
     there is none."""
-    give = (
-        "give an occupancy.safetensors, or a folder with a run that left one, as "
-        "outputs/SCENE/leco-occupancy"
-    )
+    give = "give an occupancy.safetensors, or a folder with a run that left one"
+    give += ", as outputs/SCENE/leco-occupancy"
     if not path.exists():
         raise ValueError(f"there is no {path}: {give}")
     if not path.is_dir():
@@ -67,9 +64,8 @@ def inspect(
     facts = {**describe(occupancy), "bytes": file.stat().st_size}
     space = facts["space"]
     print(f"{file}: {facts['params']} parameters in {facts['bytes'] / 1000:.1f} kB")
-    print(
-        f"space: {space['kind']} around {_listed(space['center'])}, {space['half_extent']:.4g} half"
-    )
+    center = ", ".join(f"{value:.4g}" for value in space["center"])
+    print(f"space: {space['kind']} around ({center}), {space['half_extent']:.4g} half")
     print(f"kept where o(x) >= {facts['threshold']:.4g}, asked in {facts['precision']}")
     print(f"kept share of its box: {facts['kept_share_of_box']:.2%}")
     print(f"share of its box that photographs show: {facts['seen_share_of_box']:.2%}")
@@ -154,9 +150,8 @@ def _export_in_words(out: Path, facts: dict[str, Any], frame: str | None) -> lis
     splats = facts["written"] == "splat-init"
     if not facts["photograph_colours"]:
         shown = "grey" if splats else "o(x)"
-        lines.append(
-            f"their colour is {shown}: no sparse points with colours; --data names a scene"
-        )
+        why = "no sparse points with colours; --data names a scene"
+        lines.append(f"their colour is {shown}: {why}")
     if "geographic_origin" in facts:
         lines.append(f"its origin on earth: {facts['geographic_origin']}")
     if splats:
@@ -223,16 +218,11 @@ def _draw(occupancy: Occupancy, picture: Path, description: Path | None, dark: b
     page = write_page(occupancy, picture.with_suffix(".html"), colours)
     print(f"drew {page}, to look around in with a browser")
     if colours is None:
-        print(
-            "without the colours of photographs: no coloured sparse points are known (--data SCENE)"
-        )
+        why = "no coloured sparse points are known (--data SCENE)"
+        print(f"without the colours of photographs: {why}")
 
 
 def _said(value: bool | float | str) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     return str(value) if isinstance(value, str | int) else f"{value:.4g}"
-
-
-def _listed(values: Sequence[float]) -> str:
-    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"

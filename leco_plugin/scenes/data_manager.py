@@ -84,10 +84,8 @@ class LecoDataManager(Vanilla):  # type: ignore[type-arg]
             if len(dataset) == 0:
                 say(f"no test image: the run trains on all {count} and evaluates nothing")
         if len(dataset) == 0:
-            lack = f"{self.get_datapath()} has no test image in this run"
-            none: Any = NoTestImages(
-                f"{lack}, and nothing can be evaluated; ns-render shows what it has learned"
-            )
+            lack = f"{self.get_datapath()} has no test image in this run, and nothing can be"
+            none: Any = NoTestImages(f"{lack} evaluated; ns-render shows what it has learned")
             self.eval_dataloader = self.fixed_indices_eval_dataloader = none
         return dataset
 
@@ -198,10 +196,8 @@ def _turn_of(outputs: DataparserOutputs) -> Tensor | None:
     turn = turn_to_upright(outputs.cameras.camera_to_worlds, points_in(outputs.metadata))
     if turn is not None:
         degrees = math.degrees(math.acos(max(-1.0, min(1.0, float(turn[2, 2])))))
-        say(
-            f"the survey lies on its side and is set upright, by {degrees:.0f} degrees; "
-            "--pipeline.datamanager.upright False leaves it as it is"
-        )
+        done = f"the survey lies on its side and is set upright, by {degrees:.0f} degrees"
+        say(f"{done}; --pipeline.datamanager.upright False leaves it as it is")
     return turn
 
 

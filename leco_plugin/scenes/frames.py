@@ -131,10 +131,11 @@ def box_around(box: Tensor, frame: Tensor) -> Tensor:
     return torch.cat([corners.amin(dim=0), corners.amax(dim=0)])
 
 
-# Keys of a dataparser's metadata
-METRES_PER_UNIT = "leco_metres_per_unit"  # metres in a unit of the dataset's own poses, float
-ALTITUDES = "leco_altitudes"  # z of the ground and of the top, scene units, two floats
-UP_IS_KNOWN = "leco_up_is_known"  # there where z is up in the dataset already
+METRES_PER_UNIT, ALTITUDES = "leco_metres_per_unit", "leco_altitudes"
+"""Keys of a dataparser's metadata: metres in a unit of the dataset's own poses, float; and z of the
+ground and of the top, scene units, two floats."""
+UP_IS_KNOWN = "leco_up_is_known"
+"""Key that is there where z is up in the dataset already."""
 UPRIGHT = 0.94
 """Cosine of 20 degrees: an axis of the dataset that is nearer to the model's z is up there, and
 what is nearer to z in a survey may be the slope of a hill."""

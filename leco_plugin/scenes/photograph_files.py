@@ -29,15 +29,9 @@ CONVERTED = ("1", "P", "PA", "LA", "CMYK")
 """Modes that become one of these; of CMYK by Pillow's formula, without a colour profile."""
 SAVE_ANEW = "if the file is whole, save it as JPEG or PNG with 8 bits a channel, and give that name"
 """What to do about HEIC, OpenEXR and other kinds that Pillow does not read."""
-TURNS = {
-    2: Image.Transpose.FLIP_LEFT_RIGHT,
-    3: Image.Transpose.ROTATE_180,
-    4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_270,
-    7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_90,
-}
+TURN = Image.Transpose
+TURNS = {2: TURN.FLIP_LEFT_RIGHT, 3: TURN.ROTATE_180, 4: TURN.FLIP_TOP_BOTTOM}
+TURNS |= {5: TURN.TRANSPOSE, 6: TURN.ROTATE_270, 7: TURN.TRANSVERSE, 8: TURN.ROTATE_90}
 """What sets an image upright, by EXIF's orientation."""
 
 
@@ -125,10 +119,9 @@ def remedy_for_missing(path: Path) -> str:
 def check_kind(path: Path, header: Header) -> None:
     """InputError if the colours of an image cannot be read."""
     if header.mode not in READ_RIGHTLY + CONVERTED:
-        raise InputError(
-            f"{path} is of Pillow's mode {header.mode!r}, which nerfstudio reads wrongly: save it "
-            "as JPEG or PNG with 8 bits a channel, RGB, RGBA or grey"
-        )
+        fault = f"{path} is of Pillow's mode {header.mode!r}, which nerfstudio reads wrongly"
+        remedy = "save it as JPEG or PNG with 8 bits a channel, RGB, RGBA or grey"
+        raise InputError(f"{fault}: {remedy}")
     if header.several:
         raise InputError(f"{path} holds more pictures than one: save the one that is meant alone")
 
@@ -254,20 +247,14 @@ def convert_masks(
         found.append(path if as_it_is else derived.get(path, f"mask {size}", made))
         shown.append(bool(fitting.any()))
     if not any(shown):
-        raise InputError(
-            f"the masks leave no pixel of {len(masks)} images, the first is {masks[0]}: a mask is "
-            "black where its image is not to be used"
-        )
+        none = f"the masks leave no pixel of {len(masks)} images, the first is {masks[0]}"
+        raise InputError(f"{none}: a mask is black where its image is not to be used")
     if not all(shown) and len(set(sizes)) > 1:
-        raise InputError(
-            f"the mask {found[shown.index(False)]} leaves no pixel, and each image of a scene of "
-            "many sizes must give some: leave its image out"
-        )
+        none = f"the mask {found[shown.index(False)]} leaves no pixel, and each image of a scene"
+        raise InputError(f"{none} of many sizes must give some: leave its image out")
     if grey and speak:
-        say(
-            f"{len(grey)} masks have greys between black and white, of which those from {HALF} on "
-            f"are seen; the first is {grey[0]}"
-        )
+        some = f"{len(grey)} masks have greys between black and white"
+        say(f"{some}, of which those from {HALF} on are seen; the first is {grey[0]}")
     return found
 
 
@@ -275,14 +262,6 @@ def seen_pixels(mask: Path, image: Path, size: tuple[int, int]) -> NDArray[np.bo
     """The pixels [H, W] that a mask shows of an image of this width and height; or InputError."""
     path = _found(mask, image)
     return _fit(_is_seen(_values(path)), size, path)
-
-
-def check_masked(frames: list[dict[str, Any]], folder: Path) -> None:
-    """InputError if some frames have a mask, and some have none."""
-    masked = sum("mask_path" in frame for frame in frames)
-    if 0 < masked < len(frames):
-        count = f"{masked} of {len(frames)} images have a mask_path"
-        raise InputError(f"{folder}: {count}; give one to all or to none")
 
 
 def _found(path: Path, image: Path) -> Path:
@@ -313,10 +292,8 @@ def _values(path: Path) -> NDArray[np.uint8]:
         raise InputError(f"the mask {path} cannot be read as an image {why}") from None
     lightest, darkest = rgba[..., :3].max(axis=-1), rgba[..., :3].min(axis=-1)
     if bool(((lightest - darkest)[rgba[..., 3] > 0] > COLOURED).any()):
-        raise InputError(
-            f"the mask {path} has colours: save it in black, where its image is not to be used, "
-            "and white"
-        )
+        remedy = "save it in black, where its image is not to be used, and white"
+        raise InputError(f"the mask {path} has colours: {remedy}")
     return (lightest * rgba[..., 3] // 255).astype(np.uint8)
 
 

@@ -180,10 +180,10 @@ def checked(
         numbers = scene_file.frames_of(images, scene)
         lenses = [None if number is None else scene.lenses[number] for number in numbers]
         factor = scene_file.factor_of(scene, numbers, config, cameras)
-        masks = [None if n is None else scene.frames[n].get("mask_path") for n in numbers]
+        named = [None if n is None else scene.frames[n].get("mask_path") for n in numbers]
         unread = outputs.mask_filenames is None and not hasattr(config, "masks_dir")
-        if unread and all(masks):
-            outputs.mask_filenames = [scene.mask(str(path)) for path in masks]
+        if unread and all(named):
+            outputs.mask_filenames = [scene.mask(str(path)) for path in named]
         if speak:
             scene_file.say_unused(scene.meta, scene.path)
     made = torch.cat([cameras.width, cameras.height], dim=-1).expand(len(images), -1).tolist()

@@ -25,7 +25,7 @@ from leco_plugin.scenes.lenses import (
     check_together,
     lens_of,
 )
-from leco_plugin.scenes.photograph_files import check_masked, find_file
+from leco_plugin.scenes.photograph_files import find_file
 from leco_plugin.scenes.poses import ASKED
 
 FRAMES = ("frames", "test_frames")
@@ -117,7 +117,10 @@ def read_scene_file(path: Path, split: str, folder: Path) -> SceneFile:
         raise InputError(f"{path} has {number}; a scene is seen from two places at least")
     lenses = [lens_of(meta, frame, f"{path}: {frame['file_path']}") for frame in frames]
     check_together(lenses, str(path))
-    check_masked(frames, path.parent)
+    masked = sum("mask_path" in frame for frame in frames)
+    if 0 < masked < len(frames):
+        some = f"{masked} of {len(frames)} images have a mask_path"
+        raise InputError(f"{path.parent}: {some}; give one to all or to none")
     return SceneFile(path, meta, frames, lenses, folder)
 
 

@@ -68,7 +68,10 @@ def find_points(data: Path, size: int = 1600, threads: int = 0) -> dict[str, Any
     centre = poses[:, :, 3].mean(axis=0)  # pycolmap loses digits of coordinates like UTM's
     poses[:, :, 3] -= centre
     with tempfile.TemporaryDirectory() as work:
-        require_disk(Path(work), len(chosen), _bytes_of_copies(scene, chosen, size), "TMPDIR")
+        pictures = scene.pictures()
+        sides = [min(size, max(header_of(pictures[number]).size)) for number in chosen]
+        copies = sum(BYTES_A_SQUARE * side**2 for side in sides)
+        require_disk(Path(work), len(chosen), copies, "TMPDIR")
         photographs, cameras = _copies(scene, chosen, Path(work) / "images", size)
         reconstructor = Reconstructor(Path(work), photographs, threads or usable_cores())
         reconstructor.folder.mkdir()
@@ -147,13 +150,6 @@ def _refuse_few(model: Any, matched: int, path: Path) -> None:
         f"only {agreeing} of {matched} features that the photographs share agree with the poses "
         f"in {path}: those are of other photographs, or their lenses are; `leco poses` makes both"
     )
-
-
-def _bytes_of_copies(scene: SceneFile, chosen: Sequence[int], size: int) -> float:
-    """Of disk that copies with a longest side of `size` pixels take, about."""
-    pictures = scene.pictures()
-    sides = [min(size, max(header_of(pictures[number]).size)) for number in chosen]
-    return sum(BYTES_A_SQUARE * side**2 for side in sides)
 
 
 def _copies(
