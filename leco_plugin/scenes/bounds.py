@@ -84,10 +84,9 @@ def find_bounds(
         return _between(config.altitudes, poses, directions, points)
     if points is None:
         if config.space == "box":
-            raise InputError(
-                "a bounded scene without sparse points needs its altitudes: give bounds.altitudes "
-                "with the z of its ground and of its top"
-            )
+            lack = "a bounded scene without sparse points needs its altitudes"
+            remedy = "give bounds.altitudes with the z of its ground and of its top"
+            raise InputError(f"{lack}: {remedy}")
         return _without_points(poses, directions)
     low, high = _quantiles(points, 0.001), _quantiles(points, 0.999)
     near, far = _range(_depths(poses, directions, points))
@@ -155,10 +154,8 @@ def _between(
     heights = poses[:, None, 2, 3]
     down = _go_down(directions) & (heights > ground)
     if not bool(down.any()):
-        raise InputError(
-            f"no ray of any camera goes down to the ground at z = {ground:g}: bounds.altitudes are "
-            "in scene units, +z up"
-        )
+        none = f"no ray of any camera goes down to the ground at z = {ground:g}"
+        raise InputError(f"{none}: bounds.altitudes are in scene units, +z up")
     if points is not None:
         near, far = _range(_depths(poses, directions, points))
     else:

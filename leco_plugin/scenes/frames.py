@@ -205,9 +205,8 @@ def check_poses(poses: NDArray[np.floating], names: list[str]) -> None:
         distances = np.nan_to_num(distance_from_rotations(poses[:, :3, :3]), nan=np.inf)
     if distances.max() > SKEW:
         worst = names[int(distances.argmax())]
-        raise InputError(
-            f"{worst} is no rotation: remove its scale, shear or mirroring, or leave its image out"
-        )
+        remedy = "remove its scale, shear or mirroring, or leave its image out"
+        raise InputError(f"{worst} is no rotation: {remedy}")
 
 
 # Structure from motion does not know what is down, and nerfstudio takes the photographs' top edges

@@ -128,10 +128,9 @@ def check_together(lenses: list[Lens], where: str) -> None:
 def _number(value: Any, name: str, where: str, positive: bool = False) -> float:
     sound = type(value) in (int, float) and abs(value) < 1e9
     if not sound or (positive and not value >= 1e-3):
-        raise InputError(
-            f"{where}: {name} is {str(value)[:40]!r}, and not what a camera has: give a "
-            f"{'positive ' * positive}number"
-        )
+        wanted = "a positive number" if positive else "a number"
+        given = f"{where}: {name} is {str(value)[:40]!r}, and not what a camera has"
+        raise InputError(f"{given}: give {wanted}")
     return float(value)
 
 
@@ -148,9 +147,8 @@ def _focal(
                 return value, None
             angle = math.radians(value) if name[0] == axis else value
             if angle >= math.pi:
-                raise InputError(
-                    f"{where}: {name} is {value:g}, wider than a plane can show: give fl_{axis}"
-                )
+                wide = f"{name} is {value:g}, wider than a plane can show"
+                raise InputError(f"{where}: {wide}: give fl_{axis}")
             return None, angle
     return None, None
 
@@ -175,9 +173,8 @@ def _distortion(owner: dict[str, Any], kind: CameraType | None, where: str) -> l
     if "distortion_params" in owner:
         listed = owner["distortion_params"]
         if not isinstance(listed, list):
-            raise InputError(
-                f"{where}: distortion_params is {str(listed)[:40]!r}: give a list of numbers"
-            )
+            given = f"{where}: distortion_params is {str(listed)[:40]!r}"
+            raise InputError(f"{given}: give a list of numbers")
         listed = [_number(value, "distortion_params", where) for value in listed]
         wanted = "12 numbers" if kind is CameraType.FISHEYE624 else ", ".join(DISTORTIONS)
         if len(listed) != (12 if kind is CameraType.FISHEYE624 else len(DISTORTIONS)):
@@ -188,10 +185,8 @@ def _distortion(owner: dict[str, Any], kind: CameraType | None, where: str) -> l
     elif not any(name in owner for name in DISTORTIONS):
         return None
     if kind is not None and kind not in UNDISTORTED and any(values):
-        raise InputError(
-            f"{where}: nerfstudio cannot undo the distortion of {kind.name}: set it to 0, or "
-            "undistort"
-        )
+        fault = f"nerfstudio cannot undo the distortion of {kind.name}"
+        raise InputError(f"{where}: {fault}: set it to 0, or undistort")
     return values
 
 

@@ -24,10 +24,8 @@ def alone_in(folder: Path, work: str) -> Iterator[None]:
         raise InputError(f"{folder} is no folder; name another one with --out") from None
     held = lock(folder)
     if held is None:
-        raise InputError(
-            f"another process makes the {work} in {folder}; wait for it, or name another folder "
-            "with --out"
-        )
+        taken = f"another process makes the {work} in {folder}"
+        raise InputError(f"{taken}; wait for it, or name another folder with --out")
     try:
         yield
     finally:

@@ -67,10 +67,8 @@ class LecoPhotographs(CheckedReader, ReadsNear, Nerfstudio):
             self.config.orientation_method = "none"
         outputs: DataparserOutputs = super()._generate_dataparser_outputs(split)
         if len(outputs.image_filenames) == 0 and split == "train":
-            raise InputError(
-                f"{data}: no image is left for the split {split!r}: list some in train_filenames, "
-                "or remove it"
-            )
+            none = f"{data}: no image is left for the split {split!r}"
+            raise InputError(f"{none}: list some in train_filenames, or remove it")
         try:
             applied, applied_scale = applied_in(meta, data)
             frame = from_file(parsed_frame(outputs), applied, applied_scale, torch.float64)
@@ -215,10 +213,8 @@ def find_stretch(positions: Array) -> tuple[list[int], list[int]]:
     apart = gaps[gaps > 1e-6 * gaps.max()]
     beside = rest[away <= BESIDE * np.median(apart)] if len(apart) else rest
     if count - size - len(beside) < TRAINED * count:
-        raise ValueError(
-            f"beside a stretch of {size} of {count} cameras there are {len(beside)} others, too "
-            "many to leave them out of training"
-        )
+        others = f"beside a stretch of {size} of {count} cameras there are {len(beside)} others"
+        raise ValueError(f"{others}, too many to leave them out of training")
     return sorted(held_out.tolist()), sorted(beside.tolist())
 
 

@@ -56,17 +56,12 @@ class CheckedReader(DataParser):
         except (Exception, SystemExit) as error:
             for path in () if scene is None else scene.pictures():
                 _ = header_of(path) if path.is_file() else None  # one that is none goes first
-            data = Path(config.data)
-            raise InputError(
-                f"{data} cannot be read as a scene by {reader_name(config)}: "
-                f"{_reason(error)}; {_remedy(error, config)}"
-            ) from error
+            fault = f"{Path(config.data)} cannot be read as a scene by {reader_name(config)}"
+            raise InputError(f"{fault}: {_reason(error)}; {_remedy(error, config)}") from error
         if len(self._first) == 2:
-            (clear, its_split), (solid, other) = self._first[True], self._first[False]
-            raise InputError(
-                f"{clear} of the split {its_split} has transparency, and {solid} of {other} has "
-                f"none: {SAVE_ALIKE}"
-            )
+            (clear, one), (solid, other) = self._first[True], self._first[False]
+            fault = f"{clear} of the split {one} has transparency, and {solid} of {other} has none"
+            raise InputError(f"{fault}: {SAVE_ALIKE}")
         return outputs
 
 
@@ -168,10 +163,10 @@ def checked(
     images = [Path(path) for path in outputs.image_filenames]
     cameras, factor = outputs.cameras, 1
     if cameras.camera_to_worlds.shape != (len(images), 3, 4):
-        raise InputError(  # as nerfstudio's reader of instant-ngp makes them of one photograph
-            f"{data}: {reader_name(config)} makes no cameras of {len(images)} photographs of the "
-            f"split {split}: hold out more by a lower --train-split-fraction"
-        )
+        # as nerfstudio's reader of instant-ngp makes them of one photograph
+        some = f"no cameras of {len(images)} photographs of the split {split}"
+        remedy = "hold out more by a lower --train-split-fraction"
+        raise InputError(f"{data}: {reader_name(config)} makes {some}: {remedy}")
     names = [f"{data}: the pose of {path}" for path in images]
     check_poses(cameras.camera_to_worlds.numpy(), names)
     headers = [header_of(path) for path in images]

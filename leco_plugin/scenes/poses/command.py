@@ -216,10 +216,9 @@ def summary(report: dict[str, Any]) -> list[str]:
         lines.append("more overlap between neighbours places more photographs")
     gps = report["gps"]
     if gps["used"]:
-        lines.append(
-            f"in metres by the GPS of {gps['photographs']} photographs: they are off by "
-            f"{gps['median_metres']:.2f} m (median) and {gps['most_metres']:.2f} m at most"
-        )
+        off = f"{gps['median_metres']:.2f} m (median) and {gps['most_metres']:.2f} m at most"
+        known = f"in metres by the GPS of {gps['photographs']} photographs"
+        lines.append(f"{known}: they are off by {off}")
         if not report["altitudes"]:
             lines.append("EXIF gives no altitude: heights count from the cameras, not the sea")
         if wrong := gps["contradicted"]:

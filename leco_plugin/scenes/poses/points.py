@@ -142,10 +142,8 @@ def _refuse_few(model: Any, matched: int, path: Path) -> None:
         return
     photographs = model.num_reg_images()
     if matched < 4 * FEWEST_POINTS:
-        raise InputError(
-            f"the {photographs} photographs of {path} share {matched} features, too few for "
-            "points: add photographs between them"
-        )
+        shared = f"the {photographs} photographs of {path} share {matched} features"
+        raise InputError(f"{shared}, too few for points: add photographs between them")
     raise InputError(
         f"only {agreeing} of {matched} features that the photographs share agree with the poses "
         f"in {path}: those are of other photographs, or their lenses are; `leco poses` makes both"

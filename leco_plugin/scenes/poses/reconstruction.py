@@ -154,10 +154,9 @@ class Reconstructor:
         models = [pycolmap.Reconstruction(path) for path in paths]
         models = [model for model in models if model.num_reg_images() >= FEWEST]
         if not models:
-            raise InputError(
-                f"no three of the {len(self.photographs)} photographs were found to overlap: "
-                "neighbours should share two thirds of what they show, from different places"
-            )
+            none = f"no three of the {len(self.photographs)} photographs were found to overlap"
+            wanted = "neighbours should share two thirds of what they show, from different places"
+            raise InputError(f"{none}: {wanted}")
         return sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 
     def refine(self, model: Any, lens: Lens) -> None:
