@@ -75,7 +75,8 @@ def checked_class(kind: type[DataParser]) -> type[DataParser]:
 
 def read_checked(parser: Any) -> Any:
     """A reader like this one that is checked."""
-    kind = checked_class(type(parser))
+    of: Any = type(parser)
+    kind = checked_class(of)
     return parser if isinstance(parser, kind) else kind(parser.config)
 
 

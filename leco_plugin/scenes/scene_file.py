@@ -230,7 +230,7 @@ NEEDLESS = {
 def unused_fields(meta: dict[str, Any]) -> list[str]:
     """Names of fields of a scene and of its frames that are not used and say something."""
     owners = [meta, *meta["frames"], *meta.get("test_frames", [])]
-    nothing = (None, False, 0, "", [], {})
+    nothing: tuple[Any, ...] = (None, False, 0, "", [], {})
     names = {name for owner in owners for name in owner if owner[name] not in nothing}
     return sorted(names - READ - NEEDLESS)
 

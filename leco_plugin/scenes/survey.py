@@ -158,9 +158,9 @@ def survey(
             cause = "near, far and altitudes are in scene units; leave them out to have them found"
         raise InputError(f"0% of the rays meet the scene ({bounds.reason}): {cause}")
     probes = flat_origins[hits], flat_directions[hits]
-    meeting, median_length = float(hits.float().mean()), float(lengths[hits].median())
-    known = origins[:, 0], len(hits), units, rounded_by(datamanager)
-    return Survey(bounds, *probes, meeting, median_length, *known)
+    meeting, median = float(hits.float().mean()), float(lengths[hits].median())
+    positions, rounded = origins[:, 0], rounded_by(datamanager)
+    return Survey(bounds, *probes, meeting, median, positions, len(hits), units, rounded)
 
 
 def lengths_inside(bounds: SceneBounds, origins: Tensor, directions: Tensor) -> Tensor:

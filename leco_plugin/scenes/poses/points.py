@@ -58,8 +58,8 @@ def find_points(data: Path, size: int = 1600, threads: int = 0) -> dict[str, Any
     report: dict[str, Any] = {"format": 1, "photographs": len(chosen)}
     known = read_points(scene.meta, scene.folder)
     if known is not None and len(known.positions) >= FEWEST_POINTS:
-        file = str(scene.folder / scene.meta["ply_file_path"])
-        return report | {"points": len(known.positions), "file": file, "done": False}
+        there = scene.folder / scene.meta["ply_file_path"]
+        return report | {"points": len(known.positions), "file": str(there), "done": False}
     if len(chosen) < FEWEST:
         raise InputError(f"{scene.path} has {len(chosen)} photographs; {FEWEST} or more are needed")
     load_pycolmap()
