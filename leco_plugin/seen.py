@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import zlib
+from typing import Any
 
 import numpy as np
 import torch
@@ -69,6 +70,11 @@ class SeenSpace(nn.Module):
         """The cells as bits, compressed: uint8 [K]."""
         bits = np.packbits(self.cells.cpu().numpy()).tobytes()
         return torch.tensor(list(zlib.compress(bits, 9)), dtype=torch.uint8)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        """A state without cells changes nothing: files of occupancies keep them apart."""
+        if f"{prefix}cells" in state_dict:
+            super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
 def cells_at(mapped: Tensor) -> Tensor:

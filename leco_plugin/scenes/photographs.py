@@ -200,7 +200,8 @@ def find_stretch(positions: Array) -> tuple[list[int], list[int]]:
     beside it, by number. It grows by the nearest camera each time, and so follows a line or an arc.
     ValueError if there are too few cameras, or they stand too close together."""
     if (count := len(positions)) < FEWEST:
-        raise ValueError(f"there are {count} cameras: a stretch is held out of {FEWEST} or more")
+        few = f"there are {count} cameras"
+        raise ValueError(f"{few}, and a stretch is held out of {FEWEST} or more")
     order, gaps = _grow(positions)
     low, high = max(2, round(LEAST * count)), round(MOST * count)
     behind = gaps[low - 1 : high]  # behind a stretch of `low` cameras, and so on

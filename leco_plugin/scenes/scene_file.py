@@ -193,8 +193,8 @@ def frames_of(images: list[Path], scene: SceneFile) -> list[int | None]:
         ends = [number for number, either in zip(numbers, files) if image in either]
         others = sorted({places[number] for number in numbers})
         if not ends and len(others) > 1:
-            both = f"{others[0]} and of {others[1]}"
-            raise InputError(f"{image} would be the picture of {both}: give each its own name")
+            fault = f"{image} would be the picture of {others[0]} and of {others[1]}"
+            raise InputError(f"{fault}: give them names of their own")
         found.append(next(iter(ends or numbers), None))
     return found
 
