@@ -49,13 +49,8 @@ def before_the_backdrop(
 def gate_pictures(met: Shaded, ray_indices: Tensor) -> dict[str, Tensor]:
     """What the gate did along each ray, for the viewer: each [R, 1] float32.
 
-    `occupancy` is o(x), averaged with the rendering weights; `expert` the number of the one with
-    the greatest weight, 0 for the empty-space expert; both are 0 where nothing is met.
-    `samples_per_ray` is a float because nerfstudio cannot show integers.
-
-    Args:
-        met: without the weight of backdrops.
-        ray_indices: [M] int64.
+    `occupancy` is o(x), averaged with the rendering weights; `expert` is `leading_expert`; both are
+    0 where nothing is met. `met` is without the weight of backdrops.
     """
     occupancies = occupancy_from_logits(met.logits)[:, None]
     seen = accumulate_along_rays(met.weights, occupancies, ray_indices, len(met.rgb))
@@ -83,20 +78,17 @@ def leading_expert(met: Shaded, ray_indices: Tensor, experts: int) -> Tensor:
     return expert.where(met.accumulation[:, None] >= MET, NONE)
 
 
-def with_alpha(outputs: dict[str, Tensor], output_name: str) -> Tensor:
+def with_alpha(outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
     """A colour picture with what was met before the backdrop as its alpha, [..., 4].
 
     Warns where nothing is met at all, for nerfstudio's exporter goes on until it has met enough.
-
-    Args:
-        output_name: of the picture, `rgb` somewhere in it.
     """
     accumulation = outputs[output_name.replace("rgb", "accumulation")]
     if not bool((accumulation >= MET).any()):
         warnings.warn(
             "none of these rays meets anything but the backdrop: an export finds no points there, "
             "and waits for ever if that is so everywhere, as in a run of a few steps",
-            stacklevel=3,
+            stacklevel=2,
         )
     return torch.cat([outputs[output_name], accumulation], dim=-1)
 
@@ -129,14 +121,8 @@ PRICES = ("lost_mass", "lost_surface_mass", "image_price_db")
 
 @torch.no_grad()
 def gate_statistics(shaded: Shaded, scene_experts: int) -> dict[str, Tensor]:
-    """Samples per ray, and for each expert its share of them and their mean density.
-
-    Args:
-        shaded: one batch.
-        scene_experts: n; expert 0 is the empty-space expert.
-    Returns:
-        Float scalars; densities are per half extent of the scene.
-    """
+    """Samples per ray, and for each expert its share of them and their mean density: float scalars.
+    Densities are per half extent of the scene."""
     num_samples = max(len(shaded.routes), 1)
     shares = expert_shares(shaded.routes, 1 + scene_experts)
     density = torch.zeros_like(shares).index_add_(0, shaded.routes, shaded.sigmas.float())
@@ -150,12 +136,11 @@ def gate_statistics(shaded: Shaded, scene_experts: int) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def batch_figures(outputs: dict[str, Any], truth: Tensor, experts: int) -> dict[str, Tensor]:
-    """PSNR of a batch, and in training what its gate keeps and how its experts share the points.
+    """PSNR of a batch, and in training what its gate keeps and how its scene experts share it.
 
     Args:
         outputs: of `LecoModel.get_outputs`.
         truth: [R, 3].
-        experts: of the scene.
     """
     error = torch.nn.functional.mse_loss(outputs["rgb"], truth)
     figures = {"psnr": -10.0 * torch.log10(error.clamp(min=1e-12))}
@@ -194,8 +179,7 @@ def prices(report: dict[str, Any]) -> dict[str, Tensor]:
     """What skipping costs as it was last measured: float scalars.
 
     Args:
-        report: of a frozen gate; of an older release it may lack some, and those of a gate that
-            was shrunk without a field are None.
+        report: of the gate; empty before it is frozen, and None where no field measured it.
     """
     known = {name: report.get(name) for name in PRICES}
     return {name: torch.tensor(float(x)) for name, x in known.items() if x is not None}

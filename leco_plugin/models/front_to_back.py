@@ -108,7 +108,7 @@ def shade_in_torch(scene: Scene, rays: Rays, intervals: Intervals) -> tuple[Shad
     together, order = torch.cat(asked).sort()
     answers = Answers(*(torch.cat(values).index_select(0, order) for values in zip(*heard)))
     seen = Intervals(*(values.index_select(0, together) for values in intervals))
-    return render(scene, rays, seen, answers), seen
+    return render(scene.field.color, answers, rays, seen, scene.space.half_extent), seen
 
 
 def samples_of(starts: Tensor, counts: Tensor, most: int) -> Tensor:

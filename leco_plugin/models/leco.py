@@ -176,9 +176,7 @@ class LecoModel(DrawnInViewer, Model):
         colors = figures.over_background(shaded, rays)
         return {"rgb": colors, **shown, **figures.gate_pictures(met, intervals.ray_indices)}
 
-    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
-        """Colours with what was met before the backdrop as their alpha, [..., 4]."""
-        return figures.with_alpha(outputs, output_name)
+    get_rgba_image = staticmethod(figures.with_alpha)
 
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: Any = None

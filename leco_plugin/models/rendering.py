@@ -219,20 +219,21 @@ def shade(scene: Scene, rays: Rays, intervals: Intervals, freeze_gate: bool) -> 
     Args:
         freeze_gate: no gradient reaches the gate.
     """
-    return render(scene, rays, intervals, ask(scene, rays, intervals, freeze_gate))
+    answers = ask(scene, rays, intervals, freeze_gate)
+    return render(scene.field.color, answers, rays, intervals, scene.space.half_extent)
 
 
 class Answers(NamedTuple):
-    """What gate and field say of packed samples."""
+    """What gate and field say of M points."""
 
     sigmas: Tensor
     """[M] densities per half extent."""
     features: Tensor
     """[M, width] of which colour is made."""
     logits: Tensor
-    """[M, 1 + n] of the gate."""
+    """[M, 1 + n] of the gate; Switch-NeRF's has no empty-space expert."""
     routes: Tensor
-    """[M] int64, the expert of each sample."""
+    """[M] int64, the expert of each point."""
 
 
 def ask(scene: Scene, rays: Rays, intervals: Intervals, freeze_gate: bool) -> Answers:
@@ -246,12 +247,26 @@ def ask(scene: Scene, rays: Rays, intervals: Intervals, freeze_gate: bool) -> An
     return Answers(sigmas, features, logits, routes)
 
 
-def render(scene: Scene, rays: Rays, intervals: Intervals, answers: Answers) -> Shaded:
-    """Pixels from what was said of packed intervals."""
+def render(
+    color: ColorHead,
+    answers: Answers,
+    rays: Rays,
+    intervals: Intervals,
+    half_extent: Tensor,
+    meets_backdrop: bool = True,
+) -> Shaded:
+    """Pixels from what was said of packed intervals.
+
+    Args:
+        half_extent: scalar, scene units.
+        meets_backdrop: False has a backdrop give its colour only, and count as nothing met.
+    """
     sigmas, features, logits, routes = answers
-    is_backdrop, half_extent = backdrop_of(intervals, rays), scene.space.half_extent
+    is_backdrop = backdrop_of(intervals, rays)
     weights, packed_info = weigh(sigmas, is_backdrop, intervals, half_extent, len(rays.origins))
-    rgb = composite(scene.field.color, features, weights, rays, intervals)
+    rgb = composite(color, features, weights, rays, intervals)
+    if not meets_backdrop:
+        weights = weights.masked_fill(is_backdrop, 0.0)
     accumulation, depth = sum_up(weights, rays, intervals)
     return Shaded(rgb, accumulation, depth, weights, sigmas, logits, routes, packed_info)
 

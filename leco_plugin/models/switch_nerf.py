@@ -6,11 +6,7 @@ from typing import Any
 
 import torch
 from nerfstudio.cameras.rays import RayBundle
-from nerfstudio.engine.callbacks import (
-    TrainingCallback,
-    TrainingCallbackAttributes,
-    TrainingCallbackLocation,
-)
+from nerfstudio.engine import callbacks
 from nerfstudio.model_components.renderers import RGBRenderer
 from nerfstudio.models.base_model import Model
 from torch import Tensor, nn
@@ -20,16 +16,17 @@ from leco_plugin.models.figures import image_figures, leading_expert, over_backg
 from leco_plugin.models.losses import require_finite
 from leco_plugin.models.region import Region, marching_rule
 from leco_plugin.models.rendering import (
+    Answers,
     Intervals,
     Rays,
     Shaded,
     backdrop_starts,
     mapped_middles,
+    render,
     with_backdrop,
 )
 from leco_plugin.models.switch.field import (
     NEW_DENSITY,
-    Answers,
     NearestOnTheGround,
     SwitchField,
     SwitchNerfModelConfig,
@@ -37,7 +34,6 @@ from leco_plugin.models.switch.field import (
 from leco_plugin.models.switch.rendering import (
     coarse_and_fine,
     keep_candidates,
-    render,
     switch_losses,
     switch_statistics,
 )
@@ -125,8 +121,8 @@ class SwitchNerfModel(Model):
         return {"fields": list(self.field.parameters())}
 
     def get_training_callbacks(
-        self, training_callback_attributes: TrainingCallbackAttributes
-    ) -> list[TrainingCallback]:
+        self, training_callback_attributes: callbacks.TrainingCallbackAttributes
+    ) -> list[callbacks.TrainingCallback]:
         """Finds the scene's bounds now, and returns what updates the estimator before each step."""
         assert training_callback_attributes.pipeline is not None
         asked = self.config.bounds, self.config.near, self.config.far
@@ -137,8 +133,8 @@ class SwitchNerfModel(Model):
             self.set_bounds(data.survey.bounds, data.survey.median_length)
             self.region.look(*data.covering_rays())
             announce(data.survey)
-        before = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION
-        return [TrainingCallback([before], self.update_estimator)]
+        before = callbacks.TrainingCallbackLocation.BEFORE_TRAIN_ITERATION
+        return [callbacks.TrainingCallback([before], self.update_estimator)]
 
     @torch.no_grad()
     def set_bounds(self, bounds: SceneBounds, median_length: float) -> None:
@@ -240,7 +236,8 @@ class SwitchNerfModel(Model):
                 growing=region.space.kind == "contraction",
                 jittered=self.training,
             )
-        shaded = render(self.field.color, answers, rays, intervals, region.space.half_extent)
+        given = answers, rays, intervals, region.space.half_extent
+        shaded = render(self.field.color, *given, meets_backdrop=False)
         return intervals, shaded
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:  # type: ignore[override]
@@ -267,9 +264,7 @@ class SwitchNerfModel(Model):
             outputs["expert"] = (leading + 1).float()
         return outputs
 
-    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
-        """Colours with what was met before the backdrop as their alpha, [..., 4]."""
-        return with_alpha(outputs, output_name)
+    get_rgba_image = staticmethod(with_alpha)
 
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: Any = None

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 from nerfstudio.models.base_model import ModelConfig
@@ -21,6 +21,7 @@ from leco_plugin.models.encodings import FrequencyEncoding
 from leco_plugin.models.field import ColorHead
 from leco_plugin.models.gate import logits_of
 from leco_plugin.models.hmoe import Expert
+from leco_plugin.models.rendering import Answers
 from leco_plugin.scenes.bounds import BoundsConfig
 
 SHIFT = -1.0
@@ -54,20 +55,6 @@ class SwitchFieldConfig:
     """Octaves of the encoding of the viewing direction."""
     appearance_dim: int = 48
     """Width of the appearance code of each training image; 0 is without."""
-
-
-class Answers(NamedTuple):
-    """What the field says of N points."""
-
-    sigmas: Tensor
-    """[N] float32, per half extent of the scene."""
-    features: Tensor
-    """[N, width], what colour is made of."""
-    logits: Tensor
-    """[N, experts] float32 of the gate."""
-    routes: Tensor
-    """[N] int64 in [0, experts), where the gate sends each point, also one for which its expert
-    has no place."""
 
 
 class SwitchGate(nn.Module):
@@ -154,7 +141,7 @@ class SwitchField(nn.Module):
             mapped: [N, 3] in [-1, 1].
             noise: standard deviation of what is added to the density before its activation.
             capacity_factor: places of each expert, as a multiple of an equal share of the points;
-                a point without a place has zero features. None is dropless.
+                a point without a place has zero features, and keeps its route. None is dropless.
         """
         count = len(mapped)
         projected = self.projection(self.encoding(pad_to_steady_size(mapped)))

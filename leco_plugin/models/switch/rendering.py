@@ -9,19 +9,14 @@ import torch
 from torch import Tensor
 
 from leco_plugin.models.compute.dispatch import permute_rows
-from leco_plugin.models.field import ColorHead
 from leco_plugin.models.losses import balance_loss, expert_shares
 from leco_plugin.models.rendering import (
+    Answers,
     Intervals,
     Rays,
     Shaded,
-    backdrop_of,
-    composite,
     mapped_middles,
-    sum_up,
-    weigh,
 )
-from leco_plugin.models.switch.field import Answers
 from leco_plugin.samplers.base import densities_of_samples
 from leco_plugin.samplers.packed import render_weight_from_density
 from leco_plugin.space import Space
@@ -156,12 +151,9 @@ def keep_candidates(
     density_fn: Callable[[Tensor], Tensor] | None,
     early_stop_eps: float,
 ) -> Intervals:
-    """The candidates along rays that an estimator keeps.
+    """The candidates along rays that an estimator with nerfacc's `sampling` keeps.
 
     Args:
-        estimator: anything with nerfacc's `sampling`.
-        step_size, cone_angle: of the march.
-        jittered: stratified sampling.
         density_fn: scene positions [N, 3] to densities per scene unit [N, 1]; None asks none.
         early_stop_eps: transmittance below which a sample is left out.
     """
@@ -191,32 +183,8 @@ def mapped_points(space: Space, rays: Rays, points: Tensor) -> Tensor:
     return mapped_middles(space, rays, at)
 
 
-def render(
-    color: ColorHead, answers: Answers, rays: Rays, intervals: Intervals, half_extent: Tensor
-) -> Shaded:
-    """Pixels of packed intervals; the backdrop gives its colour and counts as nothing met.
-
-    Args:
-        half_extent: scalar, scene units.
-    """
-    is_backdrop = backdrop_of(intervals, rays)
-    weights, packed_info = weigh(
-        answers.sigmas, is_backdrop, intervals, half_extent, len(rays.origins)
-    )
-    rgb = composite(color, answers.features, weights, rays, intervals)
-    met = weights.masked_fill(is_backdrop, 0.0)
-    accumulation, depth = sum_up(met, rays, intervals)
-    sigmas, _, logits, routes = answers
-    return Shaded(rgb, accumulation, depth, met, sigmas, logits, routes, packed_info)
-
-
 def switch_losses(shaded: Shaded, truth: Tensor, balance: float) -> dict[str, Tensor]:
-    """Colour loss and balanced gate loss (Switch-NeRF, section 3.3).
-
-    Args:
-        truth: [R, 3] colours of the pixels.
-        balance: weight of the balanced gate loss.
-    """
+    """Colour loss, of pixels [R, 3], and weighted balanced gate loss (Switch-NeRF, section 3.3)."""
     losses = {"rgb_loss": torch.nn.functional.mse_loss(shaded.rgb, truth)}
     if balance > 0.0 and len(shaded.routes) > 0:
         probabilities = shaded.logits.softmax(dim=-1)

@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from leco_plugin.models.field import ColorHead
-from leco_plugin.models.rendering import Rays, backdrop_of, with_backdrop
-from leco_plugin.models.switch.field import Answers
-from leco_plugin.models.switch.rendering import coarse_and_fine, keep_candidates, render
+from leco_plugin.models.rendering import Answers, Rays, backdrop_of, render, with_backdrop
+from leco_plugin.models.switch.rendering import coarse_and_fine, keep_candidates
 from leco_plugin.samplers.base import DenseEstimator
 from leco_plugin.space import Space
 
@@ -64,14 +63,14 @@ def test_the_backdrop_gives_its_colour_and_is_nothing_met() -> None:
     intervals, answers = coarse_and_fine(
         ball, SPACE, rays, rays.t_maxs - 0.5, (64, 64), False, False
     )
-    shaded = render(color, answers, rays, intervals, SPACE.half_extent)
+    shaded = render(color, answers, rays, intervals, SPACE.half_extent, meets_backdrop=False)
     met = rays.origins[:, 1:].norm(dim=-1) < 0.9
     assert bool(met.any())
     torch.testing.assert_close(shaded.accumulation[met], torch.ones(int(met.sum())))
     torch.testing.assert_close(shaded.depth[0], torch.tensor(3.0), atol=0.1, rtol=0)
 
     empty = answers._replace(sigmas=torch.zeros_like(answers.sigmas))
-    through = render(color, empty, rays, intervals, SPACE.half_extent)
+    through = render(color, empty, rays, intervals, SPACE.half_extent, meets_backdrop=False)
     assert not bool(through.accumulation.any()) and not bool(through.weights.any())
     assert torch.equal(through.depth, rays.t_maxs)
     last = answers.features.view(6, -1, 3)[:, -1]
@@ -87,9 +86,11 @@ def test_packed_samples_of_all_candidates_render_what_coarse_and_fine_do() -> No
     places = rays.origins[intervals.ray_indices] + rays.directions[intervals.ray_indices] * (
         0.5 * (intervals.t_starts + intervals.t_ends)
     ).unsqueeze(-1)
-    dense = render(color, ball(places / 10.0), rays, intervals, SPACE.half_extent)
+    dense = render(
+        color, ball(places / 10.0), rays, intervals, SPACE.half_extent, meets_backdrop=False
+    )
     own = coarse_and_fine(ball, SPACE, rays, rays.t_maxs - 0.02, (200, 400), False, False)
-    ours = render(color, own[1], rays, own[0], SPACE.half_extent)
+    ours = render(color, own[1], rays, own[0], SPACE.half_extent, meets_backdrop=False)
     torch.testing.assert_close(ours.rgb, dense.rgb, atol=2e-3, rtol=0)
     torch.testing.assert_close(ours.accumulation, dense.accumulation, atol=2e-2, rtol=0)
 
@@ -113,5 +114,7 @@ def test_there_may_be_no_rays() -> None:
         t_maxs=torch.zeros(0),
     )
     intervals, answers = coarse_and_fine(ball, SPACE, rays, rays.t_maxs, (4, 4), True, True)
-    shaded = render(ColorHead(3, 8, 1, 0, 1), answers, rays, intervals, SPACE.half_extent)
+    shaded = render(
+        ColorHead(3, 8, 1, 0, 1), answers, rays, intervals, SPACE.half_extent, meets_backdrop=False
+    )
     assert shaded.rgb.shape == (0, 3)
