@@ -115,17 +115,13 @@ class HMoE(nn.Module):
 
         nerfstudio reads a checkpoint twice, the second time without the model's part.
         """
-        if any(name.startswith(f"{prefix}experts.") for name in state_dict):
-            earlier = torch.ones_like(self.left)  # experts could not be dropped
-            self._take_on(state_dict.setdefault(f"{prefix}left", earlier))
-        super()._load_from_state_dict(state_dict, prefix, *rest)
-
-    def _take_on(self, left: Tensor) -> None:
-        for number, is_left in enumerate(left.tolist()[: len(self.left)], 1):
+        left = state_dict.get(f"{prefix}left", self.left).tolist()
+        for number, is_left in enumerate(left[: len(self.left)], 1):
             if not is_left and self.experts[number] is not None:
                 self.drop(number)
             elif is_left and self.experts[number] is None:
                 self.put_back(number, self._scene_expert().to(self.left.device))
+        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def forward(self, features: Tensor, routes: Tensor, gate_values: Tensor) -> Tensor:
         """Dispatches, applies the experts, and brings the points back in order.
