@@ -93,10 +93,7 @@ def check_sizes(config: GateConfig) -> None:
         raise ValueError(f"the gate's encoding is of an unknown kind {config.encoding.kind!r}")
     if type(config.normed) is not bool:
         raise ValueError(f"the gate's normed is {config.normed!r}, neither true nor false")
-    sizes = {**vars(config), **vars(config.encoding)}
-    for name, largest in LARGEST_SIZES.items():
-        if type(sizes[name]) is not int or not 0 < sizes[name] <= largest:
-            raise ValueError(f"the gate's {name} is {sizes[name]!r}, not in 1 to {largest}")
+    check_ranges("gate", {**vars(config), **vars(config.encoding)}, LARGEST_SIZES)
     with torch.device("meta"):
         values = sum(parameter.numel() for parameter in Gate(config).parameters())
     if values > MOST_VALUES:
@@ -106,11 +103,16 @@ def check_sizes(config: GateConfig) -> None:
         )
 
 
-class Gate(nn.Module):
-    """G(x) = softmax(W LN(MLP(gamma_g(x)))), returned as logits.
+def check_ranges(owner: str, sizes: dict[str, object], most: dict[str, int]) -> None:
+    """ValueError unless sizes are whole numbers from 1 to what they are at most."""
+    for name, largest in most.items():
+        size = sizes[name]
+        if type(size) is not int or not 0 < size <= largest:
+            raise ValueError(f"the {owner}'s {name} is {size!r}, not in 1 to {largest}")
 
-    LN leaves lengths as they are where the config has no norm.
-    """
+
+class Gate(nn.Module):
+    """G(x) = softmax(W LN(MLP(gamma_g(x)))), returned as logits."""
 
     def __init__(self, config: GateConfig) -> None:
         super().__init__()

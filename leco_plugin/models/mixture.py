@@ -33,7 +33,7 @@ from leco_plugin.occupancy import SHOWN, Occupancy, Precision, gate_precision
 from leco_plugin.samplers import marching
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.scenes.bounds import SceneBounds
-from leco_plugin.scenes.input_error import InputError, require_keys, state_of_this_version
+from leco_plugin.scenes.input_error import require_keys, state_of_this_version
 
 
 class Following(NamedTuple):
@@ -168,8 +168,7 @@ class Mixture(nn.Module):
     def follow(self, rays: Rays, intervals: Intervals, following: Following) -> Intervals:
         """Leaves out what the gate, as far as it has learned, calls empty; some rays keep all."""
         mapped = mapped_middles(self.region.space, rays, intervals)
-        with gate_precision(self.device.type, self.precision):
-            likely = self.gate.occupancy(mapped) >= following.above
+        likely = self.occupancies(mapped, self.gate) >= following.above
         dense = torch.rand_like(rays.t_mins) < following.everywhere
         shaded = (likely | dense.index_select(0, intervals.ray_indices)).nonzero()[:, 0]
         return Intervals(*(part.index_select(0, shaded) for part in intervals))
@@ -221,12 +220,8 @@ class Mixture(nn.Module):
 
     @torch.no_grad()
     def freeze(self, threshold: float, report: dict[str, Any]) -> None:
-        """Freezes the gate, or gives a frozen one another threshold.
-
-        Args:
-            threshold: o(x) from which a candidate is kept; 0 keeps all.
-            report: what that costs and saves.
-        """
+        """Freezes the gate, or gives a frozen one another threshold; 0 keeps all candidates. The
+        report says what that costs and saves."""
         self.threshold.fill_(threshold)
         self.frozen.fill_(True)
         self.gate.requires_grad_(False)
@@ -235,11 +230,8 @@ class Mixture(nn.Module):
         self._estimator = ()
 
     def sharpen(self, small: Gate, threshold: float, report: dict[str, Any]) -> None:
-        """Has a small gate say from now on what is empty; the frozen one goes on routing.
-
-        Args:
-            threshold, report: of the small gate, as for `freeze`.
-        """
+        """Has a small gate say from now on what is empty, with a threshold and report of its own;
+        the frozen one goes on routing."""
         self.small = small.requires_grad_(False)
         self.freeze(threshold, report)
 
@@ -316,10 +308,7 @@ class Mixture(nn.Module):
             with state_of_this_version():
                 sizes, small = extra[SIZES], extra["small"]
                 gate = None if small is None else Gate(GateConfig.from_dict(small))
-            try:
-                stored = from_stored(sizes, self.sizes)
-            except ValueError as error:
-                raise InputError(str(error)) from None
+            stored = from_stored(sizes, self.sizes)
             if stored != (self.sizes, self.num_images):
                 device = self.device
                 self._build(*stored)

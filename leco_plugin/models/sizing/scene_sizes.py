@@ -8,15 +8,13 @@ device. A size set by hand is kept, and sizes that depend on it follow it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import torch
 
 from leco_plugin.log import summarize
 from leco_plugin.models.compute.device import memory_of
-from leco_plugin.models.encodings import EncodingConfig
-from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.sizing.sizes import (
     Sizes,
     check,
@@ -56,8 +54,7 @@ SHARE_OF_MEMORY = 1 / 8
 """Most of the device's memory that automatic sizes take for weights and what trains them."""
 
 
-@dataclass(frozen=True)
-class Choice:
+class Choice(NamedTuple):
     """Complete sizes, and in words how they came about; no words where nothing was chosen."""
 
     sizes: Sizes
@@ -75,8 +72,7 @@ def complete(
 
     Args:
         wanted: sizes, with `AUTOMATIC` where they are to be chosen.
-        bounds: where the scene lies, where the data do not say it.
-        metadata: what a dataset says of itself, with its cameras (`detail.CAMERAS`) and sparse
+        metadata: what a dataset says of itself, with its cameras (`survey.CAMERAS`) and sparse
             points; without cameras sizes are those of the device.
         images: training photographs.
     Raises:
@@ -111,9 +107,8 @@ def choose(
     """Fills in what is automatic.
 
     Args:
-        wanted: sizes, with `AUTOMATIC` where they are to be chosen.
         most: complete sizes, the largest that are chosen.
-        detail: of the scene; None where nothing is known of it: all is as large as it may be.
+        detail: None where nothing is known of the scene: all is as large as it may be.
         images: training photographs, which have codes of their own.
         memory: bytes of the device; None where it is not known.
     Raises:
@@ -136,81 +131,51 @@ def choose(
 
 
 def _filled(wanted: Sizes, most: Sizes, detail: SceneDetail | None) -> Sizes:
+    """Sizes for the texels of a scene, as many as may be where they are not known."""
     texels = detail.texels if detail is not None else math.inf
     across = detail.across if detail is not None else math.inf
+    top, largest, widest = most.field.encoding, most.field.experts, most.gate
     # a number that is 0 is automatic: whatever stands before `or` has been set by hand
     encoding, experts, gate = wanted.field.encoding, wanted.field.experts, wanted.gate
-    cells = finest_cells(across, most.field.encoding)
-    finest = encoding.finest or cells
+    finest = encoding.finest or _in_granules(across, FEWEST_CELLS, top.finest)
+    # levels are about as far from one another as those of the device
+    step = math.log(top.finest / top.coarsest) / max(top.levels - 1, 1)
+    levels = 1 + round(math.log(max(1.0, finest / top.coarsest)) / step)
+    entries = ENTRIES_PER_TEXEL * min(texels, 2.0**top.log2_table)
+    log2_table = round(math.log2(max(1.0, entries)))
     encoding = replace(
         encoding,
         finest=finest,
-        levels=encoding.levels or levels_to(finest, most.field.encoding),
-        log2_table=encoding.log2_table or log2_entries(texels, most.field.encoding),
+        levels=encoding.levels or _between(2, levels, top.levels),
+        log2_table=encoding.log2_table or _between(FEWEST_ENTRIES, log2_table, top.log2_table),
     )
-    number = experts.scene_experts or gate.scene_experts or expert_number(texels, most)
-    experts = replace(
-        experts, scene_experts=number, width=experts.width or expert_width(texels, most)
-    )
-    octaves = gate.encoding.octaves or octaves_for(finest, most.gate)
+    wished = math.ceil(min(texels / TEXELS_PER_EXPERT, largest.scene_experts))
+    chosen = _between(1, wished, largest.scene_experts)
+    number = experts.scene_experts or gate.scene_experts or chosen
+    # where one expert is too many its values, which go with the square of its width, follow texels
+    units = largest.width * math.sqrt(min(1.0, texels / TEXELS_PER_EXPERT))
+    width = experts.width or _in_granules(units, GRANULE, largest.width)
+    octaves = 1 + round(math.log2(max(1.0, finest / CELLS_PER_PERIOD)))
+    octaves = gate.encoding.octaves or _between(FEWEST_OCTAVES, octaves, widest.encoding.octaves)
+    features = 3 + 6 * octaves
     gate = replace(
         gate,
         encoding=replace(gate.encoding, octaves=octaves),
-        width=gate.width or gate_width(octaves, most.gate),
+        width=gate.width or _in_granules(UNITS_PER_FEATURE * features, GRANULE, widest.width),
         scene_experts=gate.scene_experts or number,
     )
+    experts = replace(experts, scene_experts=number, width=width)
     return replace(
         wanted, gate=gate, field=replace(wanted.field, encoding=encoding, experts=experts)
     )
 
 
-def finest_cells(across: float, most: EncodingConfig) -> int:
-    """Cells no larger than a footprint, in sixteens."""
-    wanted = GRANULE * math.ceil(min(across, most.finest) / GRANULE)
-    return max(FEWEST_CELLS, min(wanted, most.finest))
+def _between(least: int, wanted: int, most: int) -> int:
+    return max(least, min(wanted, most))
 
 
-def levels_to(finest: int, most: EncodingConfig) -> int:
-    """Levels up to so many cells, about as far from one another as those of the device."""
-    step = math.log(most.finest / most.coarsest) / max(most.levels - 1, 1)
-    wanted = 1 + round(math.log(max(1.0, finest / most.coarsest)) / step)
-    return max(2, min(wanted, most.levels))
-
-
-def log2_entries(texels: float, most: EncodingConfig) -> int:
-    """Binary logarithm of a level's entries, rounded."""
-    if math.isinf(texels):
-        return most.log2_table
-    wanted = ENTRIES_PER_TEXEL * texels
-    return max(FEWEST_ENTRIES, min(round(math.log2(max(1.0, wanted))), most.log2_table))
-
-
-def expert_number(texels: float, most: Sizes) -> int:
-    """Scene experts, rounded up."""
-    largest = most.field.experts.scene_experts
-    return max(1, min(math.ceil(min(texels / TEXELS_PER_EXPERT, largest)), largest))
-
-
-def expert_width(texels: float, most: Sizes) -> int:
-    """Units of an expert: the device's, or where one expert is too many as its values, which go
-    with the square, follow the texels."""
-    share = min(1.0, texels / TEXELS_PER_EXPERT)
-    return _in_granules(most.field.experts.width * math.sqrt(share), most.field.experts.width)
-
-
-def octaves_for(cells: int, most: GateConfig) -> int:
-    """Octaves down to a period of `CELLS_PER_PERIOD` finest cells."""
-    wanted = 1 + round(math.log2(max(1.0, cells / CELLS_PER_PERIOD)))
-    return max(FEWEST_OCTAVES, min(wanted, most.encoding.octaves))
-
-
-def gate_width(octaves: int, most: GateConfig) -> int:
-    """Units of the gate's hidden layers, in proportion to its features."""
-    return _in_granules(UNITS_PER_FEATURE * (3 + 6 * octaves), most.width)
-
-
-def _in_granules(wanted: float, most: int) -> int:
-    return min(most, GRANULE * max(1, math.ceil(wanted / GRANULE)))
+def _in_granules(wanted: float, least: int, most: int) -> int:
+    return _between(least, GRANULE * math.ceil(min(wanted, most) / GRANULE), most)
 
 
 def within(sizes: Sizes, images: int, memory: float) -> Sizes:
@@ -229,16 +194,8 @@ def explain(
     images: int,
     table_reason: str,
 ) -> tuple[str, ...]:
-    """For the log: what was counted, and each size that could be chosen with its reason.
-
-    Args:
-        wanted: with `AUTOMATIC` where a size was chosen.
-        most: the largest that are chosen.
-        sizes: as they are now.
-        detail: of the scene, if anything is known of it.
-        images: training photographs.
-        table_reason: for the size of the hash table.
-    """
+    """For the log: what was counted, and each size that could be chosen with its reason; arguments
+    as for `choose`."""
     head = "sizes of the device; nothing is known of the scene:"
     if detail is not None:
         head = (

@@ -12,7 +12,7 @@ import torch
 
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig, HMoEField
-from leco_plugin.models.gate import LARGEST_SIZES, Gate, GateConfig, check_sizes
+from leco_plugin.models.gate import LARGEST_SIZES, Gate, GateConfig, check_ranges, check_sizes
 from leco_plugin.models.hmoe import HMoEConfig
 from leco_plugin.scenes.input_error import InputError
 
@@ -146,7 +146,7 @@ def from_stored(values: dict[str, Any], sizes: Sizes) -> tuple[Sizes, int]:
     """Inverse of `to_store`; what it does not hold is that of `sizes`.
 
     Raises:
-        ValueError: there is a size in it that this release does not know.
+        InputError: there is a size in it that this release does not know.
     """
     try:
         field = dict(values["field"])
@@ -157,7 +157,7 @@ def from_stored(values: dict[str, Any], sizes: Sizes) -> tuple[Sizes, int]:
         found = replace(sizes, gate=gate, field=FieldConfig(**field), **marched)
         return found, int(values["images"])
     except (KeyError, TypeError) as error:
-        raise ValueError(
+        raise InputError(
             f"the checkpoint's sizes are of another release of this package ({error})"
         ) from None
 
@@ -176,10 +176,7 @@ def sizes_to_resume(wanted: Sizes, stored: dict[str, Any]) -> Sizes:
     Raises:
         InputError: a size set by hand is another one.
     """
-    try:
-        sizes, _ = from_stored(stored, wanted)
-    except ValueError as error:
-        raise InputError(str(error)) from None
+    sizes, _ = from_stored(stored, wanted)
     filled = wanted
     for path in left_open(wanted):
         filled = with_size(filled, path, size_at(sizes, path))
@@ -215,11 +212,7 @@ LARGEST_IN_FIELD = {**LARGEST_SIZES, "log2_table": 28}
 
 
 def values_of(sizes: Sizes, images: int) -> int:
-    """Learned values of gate and field together.
-
-    Args:
-        images: training photographs, which have codes of their own.
-    """
+    """Learned values of gate and field together; each training photograph has a code."""
     with torch.device("meta"):
         modules = Gate(sizes.gate), HMoEField(sizes.field, images)
     return sum(p.numel() for module in modules for p in module.parameters())
@@ -258,14 +251,7 @@ def check(sizes: Sizes) -> None:
 
 
 def check_memory(sizes: Sizes, images: int, memory: int) -> None:
-    """Refuses what cannot be trained, before anything of it is allocated.
-
-    Args:
-        images: training photographs.
-        memory: bytes of the device.
-    Raises:
-        ValueError: in one line, what is needed and what there is.
-    """
+    """ValueError, in one line, if training needs more than these bytes of a device."""
     needed = state_bytes(sizes, images)
     if needed > memory:
         raise ValueError(
@@ -277,11 +263,7 @@ def check_memory(sizes: Sizes, images: int, memory: int) -> None:
 
 def _check_field(sizes: Sizes) -> None:
     encoding, experts = sizes.field.encoding, sizes.field.experts
-    parts = {**vars(encoding), **{k: getattr(experts, k) for k in ("width", "layers")}}
-    parts["scene_experts"] = experts.scene_experts
-    for name, largest in LARGEST_IN_FIELD.items():
-        if type(parts[name]) is not int or not 0 < parts[name] <= largest:
-            raise ValueError(f"the field's {name} is {parts[name]!r}, not in 1 to {largest}")
+    check_ranges("field", {**vars(encoding), **vars(experts)}, LARGEST_IN_FIELD)
     for name, least in (("appearance_dim", 0), ("direction_octaves", 0), ("color_width", 1)):
         if getattr(sizes.field, name) < least:
             raise ValueError(f"the field's {name} is {getattr(sizes.field, name)}, below {least}")
