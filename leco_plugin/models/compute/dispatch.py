@@ -74,12 +74,7 @@ Expert = Callable[[Tensor], Tensor]
 
 
 class Places:
-    """Where rows go that are sorted by a key, each key's rows up to a steady size.
-
-    Args:
-        keys: [N] int64 in [0, num_keys).
-        num_keys: how many keys there are.
-    """
+    """Where rows go that are sorted by keys [N] int64, each key's rows up to a steady size."""
 
     sizes: list[int]
     """Rows of each key, filling included; they sum up to P."""
@@ -162,7 +157,6 @@ def within_capacity(
     Args:
         routes: [N] int64 in [0, num_experts).
         gate_values: [N], the gate's probability of the chosen expert.
-        num_experts: number of experts.
         capacity_factor: places, as a multiple of an equal share of the points.
     Returns:
         bool [N].

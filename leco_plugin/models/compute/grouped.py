@@ -25,12 +25,8 @@ ROWS, ROUNDS = 1 << 15, 5
 
 @functools.cache
 def is_grouping_faster(device: torch.device, n: int, width: int) -> bool:
-    """Whether grouped products are right and faster on this device; tried once, said in one line.
-
-    Args:
-        n: number of experts.
-        width: of their layers.
-    """
+    """Whether grouped products, of n experts, are right and faster on this device; tried once, said
+    in one line."""
     with (
         torch.inference_mode(False),
         torch.enable_grad(),
@@ -183,7 +179,6 @@ def may_group(features: Tensor, n: int, width: int) -> bool:
     Args:
         features: [N, width].
         n: number of experts.
-        width: of their layers.
     """
     device = features.device.type
     if device != "cuda" or width % 8 or not len(features):

@@ -106,16 +106,22 @@ def hash_sums(positions: Tensor, resolutions: Tensor, table: Tensor, corners: in
     """
     levels, (rows, features) = len(resolutions), table.shape
     out = positions.new_empty(len(positions), levels * features)
-    routine = routine_of("hash_sums")
     positions, resolutions = positions.contiguous(), resolutions.float().contiguous()
     pointers = pointers_to(positions, resolutions, table, out)
     sizes = (levels, log2_of(rows // levels), features, corners)
+    _of_points("hash_sums", pointers, len(positions), sizes)
+    return out
+
+
+def _of_points(name: str, before: Sequence[Any], count: int, after: Sequence[Any]) -> None:
+    """Calls a routine on parts of so many points; where a part begins and ends stands between its
+    other arguments."""
+    routine = routine_of(name)
 
     def work(begin: int, end: int) -> None:
-        routine(*pointers, ctypes.c_int64(begin), ctypes.c_int64(end), *sizes)
+        routine(*before, ctypes.c_int64(begin), ctypes.c_int64(end), *after)
 
-    in_threads(work, len(positions), len(positions) // FEWEST)
-    return out
+    in_threads(work, count, count // FEWEST)
 
 
 def hash_gradients(
@@ -159,16 +165,10 @@ def gate_logits(
     width, outputs = len(parts[0]), len(parts[-1])
     layers = len(parts) // 2 - 2
     logits = mapped.new_empty(len(mapped), outputs)
-    routine, addresses = routine_of("gate_logits"), addresses_of(parts)
-    pointers = pointers_to(mapped, scales)
+    given = *pointers_to(mapped, scales), addresses_of(parts), *pointers_to(logits)
     strides = ctypes.c_int64(mapped.stride(1)), ctypes.c_int64(mapped.stride(0))
     sizes = (len(scales), fresh, layers, width, outputs, ctypes.c_float(epsilon))
-
-    def work(begin: int, end: int) -> None:
-        part = ctypes.c_int64(begin), ctypes.c_int64(end)
-        routine(*pointers, addresses, *pointers_to(logits), *part, *strides, *sizes)
-
-    in_threads(work, len(mapped), len(mapped) // FEWEST)
+    _of_points("gate_logits", given, len(mapped), (*strides, *sizes))
     return logits
 
 
@@ -178,33 +178,24 @@ def field_densities(
     factors: Tensor,
     parts: Sequence[Tensor | None],
     layers: int,
-    order: Tensor | None = None,
+    order: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Hidden features [N, width] and raw densities [N] of a field of experts, without a graph.
 
     Args:
-        features: [N, inputs] float32 of the encoding.
+        features: [N, inputs] float32 of the encoding; contiguous, as the next two are.
         routes: [N] int64, the expert of each point.
         factors: [N] float32 of the hidden features.
         parts: weights and biases of the projection and of the density, then those of each expert's
             layers; None for those of an expert that adds nothing.
         layers: of an expert.
-        order: [N] int64, points in the order of their routes; None sorts them.
+        order: [N] int64, points in the order of their routes.
     """
     width = len(parts[1])  # type: ignore[arg-type]
     hidden, raw = features.new_empty(len(features), width), features.new_empty(len(features))
-    routine, addresses = routine_of("field_densities"), addresses_of(parts)
-    routes = routes.long().contiguous()
-    order = routes.argsort() if order is None else order
-    features, factors = features.contiguous(), factors.contiguous()
     pointers = pointers_to(features, order, routes, factors)
-
-    def work(begin: int, end: int) -> None:
-        part = ctypes.c_int64(begin), ctypes.c_int64(end)
-        sizes = features.shape[1], width, layers
-        routine(*pointers, addresses, *pointers_to(hidden, raw), *part, *sizes)
-
-    in_threads(work, len(features), len(features) // FEWEST)
+    given = *pointers, addresses_of(parts), *pointers_to(hidden, raw)
+    _of_points("field_densities", given, len(features), (features.shape[1], width, layers))
     return hidden, raw
 
 

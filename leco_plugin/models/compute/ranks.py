@@ -49,10 +49,7 @@ def share(tensors: Iterable[Tensor]) -> None:
 
 def from_first(make: Callable[[], T], device: torch.device) -> T:
     """What `make` returns in the first process, plain values; the others wait and do not call it.
-
-    Args:
-        device: of the process.
-    """
+    As below, `device` is that of the process."""
     if not is_distributed():
         return make()
     made = [make() if is_first() else None]
@@ -61,11 +58,7 @@ def from_first(make: Callable[[], T], device: torch.device) -> T:
 
 
 def mean(value: float, device: torch.device) -> float:
-    """Mean of a number over all processes, the same to the last bit in each.
-
-    Args:
-        device: of the process.
-    """
+    """Mean of a number over all processes, the same to the last bit in each."""
     if not is_distributed():
         return value
     total = torch.tensor(value, dtype=torch.float64, device=device)
@@ -75,11 +68,7 @@ def mean(value: float, device: torch.device) -> float:
 
 def averaging(model: nn.Module, device: torch.device) -> nn.Module:
     """The model as one to train with: its weights become those of the first process, and gradients
-    after `backward` are the mean over all processes.
-
-    Args:
-        device: of the process, where the model is.
-    """
+    after `backward` are the mean over all processes."""
     if not is_distributed():
         return model
     numbers = None if device.type == "cpu" else [device.index]
