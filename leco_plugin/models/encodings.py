@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -37,14 +37,6 @@ class EncodingConfig:
     """Hash: cells along the cube at the finest level."""
     plane_cells: int = 128
     """VM, and the finest level of K-planes: cells along the cube; memory grows with the square."""
-
-
-class Encoding(Protocol):
-    """What the gate and the field ask of an encoding."""
-
-    out_dim: int
-
-    def __call__(self, mapped: Tensor) -> Tensor: ...
 
 
 FRESH = {torch.float32: 4, torch.float16: 6, torch.bfloat16: 8}
@@ -136,13 +128,8 @@ class _InterpolateTable(torch.autograd.Function):
         if gradient.device.type == "cpu":
             return None, None, sum_by_row(rows, weights, gradient, size).to(gradient.dtype)
         spread = (weights[..., None] * gradient[:, None, :]).reshape(-1, features)
-        return (
-            None,
-            None,
-            torch.zeros(size, features, device=gradient.device, dtype=gradient.dtype).index_add_(
-                0, rows.flatten(), spread
-            ),
-        )
+        whole = gradient.new_zeros(size, features)
+        return None, None, whole.index_add_(0, rows.flatten(), spread)
 
 
 class _NativeSums(torch.autograd.Function):
@@ -228,9 +215,8 @@ class HashEncoding(nn.Module):
             return features
         rows, weights = self.rows_and_weights(mapped)
         with torch.autocast(mapped.device.type, enabled=False):
-            return _InterpolateTable.apply(rows, weights, self.table).view(
-                len(mapped), self.out_dim
-            )
+            sums = _InterpolateTable.apply(rows, weights, self.table)
+        return sums.view(len(mapped), self.out_dim)
 
 
 COLUMNS, ROWS, ACROSS = [0, 0, 1], [1, 2, 2], [2, 1, 0]
@@ -310,9 +296,10 @@ class KPlanesEncoding(nn.Module):
             return torch.cat([level[0] * level[1] * level[2] for level in levels]).t()
 
 
-def build_encoding(
-    config: EncodingConfig,
-) -> FrequencyEncoding | HashEncoding | VectorMatrixEncoding | KPlanesEncoding:
+Encoding = FrequencyEncoding | HashEncoding | VectorMatrixEncoding | KPlanesEncoding
+
+
+def build_encoding(config: EncodingConfig) -> Encoding:
     """The module that `config` describes."""
     levels, features, coarsest = config.levels, config.features, config.coarsest
     if config.kind == "hash":

@@ -93,11 +93,8 @@ class ColorHead(nn.Module):
     """One hidden layer over features, encoded direction and the appearance code of an image.
 
     Args:
-        width: of the features.
-        hidden: units of the hidden layer.
-        direction_octaves: octaves of the encoding of the viewing direction.
-        appearance_dim: width of the appearance code of each training image; 0 is without.
-        num_images: number of training images.
+        width, hidden: of the features, and of the hidden layer.
+        appearance_dim: width of the code of each training image; 0 is without.
     """
 
     opponent: Tensor

@@ -36,11 +36,7 @@ def imbalanced_gate_loss(probabilities: Tensor, routes: Tensor, empty_ratio: flo
         empty_ratio: rho, in (0, 1).
     Returns:
         Scalar; one at the stationary point.
-    Raises:
-        ValueError: when rho is not inside (0, 1).
     """
-    if not 0.0 < empty_ratio < 1.0:
-        raise ValueError(f"the target empty ratio must lie in (0, 1), got {empty_ratio}")
     num_experts = probabilities.shape[-1]
     weights = torch.full(
         (num_experts,), (num_experts - 1) / (1.0 - empty_ratio), device=probabilities.device
@@ -220,13 +216,11 @@ def first_non_finite(losses: dict[str, Tensor]) -> str | None:
 def require_finite(
     losses: dict[str, Tensor], model: nn.Module, outputs: dict[str, Any], image: Tensor
 ) -> None:
-    """Refuses losses that are not finite, before a step is taken with them.
+    """FloatingPointError, with the likely cause, for losses that are not finite: no step is taken.
 
     Args:
         outputs: of the batch; where they hold `rays` and `shaded`, these are suspects too.
         image: what the batch was compared with.
-    Raises:
-        FloatingPointError: says which loss, and the likely cause.
     """
     name = first_non_finite(losses)
     if name is not None:
@@ -238,10 +232,8 @@ def explain_non_finite(name: str, model: nn.Module, outputs: dict[str, Any], ima
     rays, shaded = outputs.get("rays"), outputs.get("shaded")
     suspects = [("the training image holds values that are not finite", image)]
     if rays is not None:
-        suspects += [
-            ("a ray is not finite: check the camera poses", rays.directions),
-            ("a ray is not finite: check the camera poses", rays.origins),
-        ]
+        of_rays = rays.directions, rays.origins
+        suspects += [("a ray is not finite: check the camera poses", each) for each in of_rays]
     suspects += [
         (f"parameter {key} is not finite: the learning rate is probably too high", value)
         for key, value in model.named_parameters()

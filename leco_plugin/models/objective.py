@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
@@ -25,6 +25,9 @@ from leco_plugin.models.losses import (
 )
 from leco_plugin.models.rendering import Intervals, Rays, Shaded, backdrop_of
 from leco_plugin.scenes.input_error import require
+
+if TYPE_CHECKING:
+    from leco_plugin.models.leco_config import LecoModelConfig
 
 DARK = 0.1
 """Brightness, of the largest channel, from which a pixel of a bounded scene shows something."""
@@ -72,19 +75,8 @@ class GateLossConfig:
         require(asked, "gate-loss.empty-ratio", ratio, f"{inside}, or None for equal shares")
 
 
-class FieldLossWeights(Protocol):
-    """Weights of what teaches the field beside colours; see `LecoModelConfig`."""
-
-    distortion: float
-    distortion_after: float
-    termination: float
-    nearness: float
-    transparency: float
-    ground: float
-
-
 def field_losses(
-    weights: FieldLossWeights,
+    weights: LecoModelConfig,
     shaded: Shaded,
     intervals: Intervals,
     rays: Rays,

@@ -246,13 +246,8 @@ def with_ends_for_all(rays: Rays, far: Tensor, length: Tensor) -> Rays:
 
 
 def within_crop(rays: Rays, nears: Tensor | None, fars: Tensor | None) -> Rays:
-    """Rays between the nears and fars that a crop gives a bundle.
-
-    A ray that the crop ends before its own end has no backdrop.
-
-    Args:
-        nears, fars: [R] or [R, 1], scene units; None is no crop.
-    """
+    """Rays between the nears and fars of a crop, see `Region.rays`. A ray that the crop ends before
+    its own end has no backdrop."""
     if nears is None or fars is None:
         return rays
     t_maxs = rays.t_maxs.minimum(fars.reshape(-1))
