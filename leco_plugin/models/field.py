@@ -168,8 +168,8 @@ class ColorHead(nn.Module):
     def suits_native(self, features: Tensor, weights: Tensor) -> bool:
         """Whether `networks.c` gives the colours of rays, and `gradients.c` what they teach."""
         widest = max(features.shape[-1], self.out.in_features)
-        known = widest <= native.WIDEST and not torch.is_autocast_enabled("cpu")
-        return known and native.suits(features, weights, self.out.weight)
+        known = widest <= native.WIDEST
+        return known and native.suits_networks(features, weights, self.out.weight)
 
     def native_parts(self) -> list[Tensor]:
         """Weights and biases of both layers, the last one's for red, green and blue."""
@@ -240,7 +240,7 @@ class HMoEField(nn.Module):
         """
         parts = self.native_parts() if self.suits_native() else []
         asked = mapped, gate_values, *(part for part in parts if part is not None)
-        if parts and (native.answers_without_graph(*asked) or native.learns(*asked)):
+        if parts and native.suits_networks(*asked):
             features, layers = self.encoding(mapped), self.config.experts.layers
             given = features, routes, gate_values, layers, *parts
             hidden, raw = FieldDensities.apply(*given)

@@ -46,24 +46,15 @@ MANY_RAYS = 2048
 
 
 def is_no_slower(num_rays: int, guided: bool, device: torch.device) -> bool:
-    """Whether shading from the front in torch was measured to take no longer than shading all.
-
-    Args:
-        num_rays: in the batch.
-        guided: whether only what an occupancy keeps is shaded.
-        device: of the model.
-    """
+    """Whether shading a batch from the front in torch was measured to take no longer than shading
+    all; `guided` is where only what an occupancy keeps is shaded."""
     return guided and device.type == "cpu" and num_rays >= MANY_RAYS
 
 
 def shade_where_faster(
     scene: Scene, rays: Rays, intervals: Intervals, guided: bool
 ) -> tuple[Shaded, Intervals] | None:
-    """`shade_front_to_back`, or None where it was not measured to take no longer than shading all.
-
-    Args:
-        guided: whether only what an occupancy keeps is shaded.
-    """
+    """`shade_front_to_back`, or None where that was not measured to take no longer."""
     if suits_native(scene, rays, intervals):
         return shade_natively(scene, rays, intervals)
     if is_no_slower(len(rays.origins), guided, rays.origins.device):
@@ -131,8 +122,9 @@ def suits_native(scene: Scene, rays: Rays, intervals: Intervals) -> bool:
         and len(rays.origins) > 0
         and isinstance(field.encoding, HashEncoding)
         and field.suits_native()
+        and not (torch.is_grad_enabled() and gate.head.weight.requires_grad)
     )
-    return known and gate.answers_natively(rays.origins) and native.suits(*rays[:4], *intervals[1:])
+    return known and gate.suits_native(rays.origins) and native.suits(*rays[:4], *intervals[1:])
 
 
 @in_float32

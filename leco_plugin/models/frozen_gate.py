@@ -58,7 +58,7 @@ def occupancy_of(gate: Gate, mapped: Tensor, dtype: torch.dtype) -> Tensor:
         [N] float32 in [0, 1].
     """
     with torch.no_grad(), torch.autocast("cpu", enabled=False):
-        if dtype == torch.float32 and gate.answers_natively(mapped):
+        if dtype == torch.float32 and gate.suits_native(mapped):
             return gate.occupancy(mapped)
     count = len(mapped)
     filling = filled_size(count) - count

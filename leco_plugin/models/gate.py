@@ -127,7 +127,7 @@ class Gate(nn.Module):
 
     def forward(self, mapped: Tensor) -> Tensor:
         """Mapped positions [N, 3] in [-1, 1] to logits [N, 1 + n] float32; 0 is emptiness."""
-        if self.answers_natively(mapped) or self.learns_natively(mapped):
+        if self.suits_native(mapped):
             scales: Tensor = self.encoding.scales  # type: ignore[union-attr, assignment]
             given = mapped, scales, FRESH[torch.float32], self.norm.eps, *self.native_parts()
             logits: Tensor = GateLogits.apply(*given)
@@ -137,18 +137,12 @@ class Gate(nn.Module):
             features = torch.relu(layer(features))
         return logits_of(features, self.norm, self.head)[: len(mapped)]
 
-    def answers_natively(self, mapped: Tensor) -> bool:
-        """Whether `networks.c` is asked about these positions now, without a graph."""
-        return self._suits_native() and native.answers_without_graph(mapped, self.head.weight)
-
-    def learns_natively(self, mapped: Tensor) -> bool:
-        """Whether it is, and `gradients.c` differentiates it. Positions want no gradient."""
-        known = self._suits_native() and not mapped.requires_grad
-        return known and native.learns(mapped, *self.native_parts())
-
-    def _suits_native(self) -> bool:
+    def suits_native(self, mapped: Tensor) -> bool:
+        """Whether `networks.c` is asked about these positions, which get no gradient."""
         widest = max(self.encoding.out_dim, self.config.width, 1 + self.config.scene_experts)
-        return isinstance(self.encoding, FrequencyEncoding) and widest <= native.WIDEST
+        known = isinstance(self.encoding, FrequencyEncoding) and widest <= native.WIDEST
+        without = not (torch.is_grad_enabled() and mapped.requires_grad)
+        return known and without and native.suits_networks(mapped, self.head.weight)
 
     def native_parts(self) -> list[Tensor]:
         """Weights and biases as `networks.c` takes them."""

@@ -55,7 +55,7 @@ def test_a_gate_learns_as_torch_does(
     gate = Gate(GateConfig(EncodingConfig(octaves=octaves), width, layers, 3, normed))
     gate.norm.bias.data.normal_()
     mapped = (torch.rand(3, 157) * 2 - 1).t()  # the strides of the march
-    assert gate.learns_natively(mapped)
+    assert gate.suits_native(mapped)
     check(lambda: (gate(mapped),), list(gate.parameters()), monkeypatch)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import os
-import sys
 from pathlib import Path
 
 import torch
@@ -47,7 +46,7 @@ def keep_freed_memory(device: torch.device | str = "cpu") -> None:
 
     Acts on this process; does nothing where the C library is not glibc.
     """
-    if torch.device(device).type != "cpu" or not sys.platform.startswith("linux"):
+    if torch.device(device).type != "cpu":
         return
     try:
         mallopt = ctypes.CDLL("libc.so.6").mallopt
@@ -69,38 +68,34 @@ def memory_of(device: torch.device | str, group: Path = GROUP) -> int | None:
         return int(torch.cuda.get_device_properties(device).total_memory)
     if device.type != "cpu":
         return None
-    try:
-        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):  # a system without these names
-        return None
-    try:
-        return min(memory, int((group / "memory.max").read_text()))
-    except (OSError, ValueError):  # no container, or one without a limit
-        return memory
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    limit = _number_in(group / "memory.max")
+    return memory if limit is None else min(memory, limit)
 
 
 def free_memory(meminfo: Path = Path("/proc/meminfo"), group: Path = GROUP) -> int | None:
     """Bytes that this process may still take, a container's limit included; None if unknown."""
-    limits = []
-    try:
-        fields = (line.split() for line in meminfo.read_text().splitlines())
-        limits += [int(field[1]) * 1024 for field in fields if field[:1] == ["MemAvailable:"]]
-    except OSError:
-        pass
-    try:
-        most = (group / "memory.max").read_text().strip()
-        if most != "max":
-            taken = int((group / "memory.current").read_text()) - _given_back(group)
-            limits.append(int(most) - taken)
-    except (OSError, ValueError):
-        pass
-    return min(limits) if limits else None
+    limits = [1024 * kilobytes for kilobytes in _fields_of(meminfo, "MemAvailable:")]
+    most, taken = _number_in(group / "memory.max"), _number_in(group / "memory.current")
+    if most is not None and taken is not None:
+        # the system takes back the cache of files when asked
+        cached = sum(_fields_of(group / "memory.stat", "active_file", "inactive_file"))
+        limits.append(most - taken + cached)
+    return min(limits, default=None)
 
 
-def _given_back(group: Path) -> int:
-    """Bytes that a container has in the cache of files, and the system takes back when asked."""
+def _number_in(file: Path) -> int | None:
+    """What a file says; None where it is not there, or says `max`, which is no limit."""
     try:
-        fields = (line.split() for line in (group / "memory.stat").read_text().splitlines())
-        return sum(int(value) for name, value in fields if name in ("active_file", "inactive_file"))
+        return int(file.read_text())
     except (OSError, ValueError):
-        return 0
+        return None
+
+
+def _fields_of(file: Path, *names: str) -> list[int]:
+    """Of a file with a name and a number in each line; none where it cannot be read."""
+    try:
+        rows = [line.split() for line in file.read_text().splitlines()]
+        return [int(row[1]) for row in rows if row[0] in names]
+    except (OSError, ValueError, IndexError):
+        return []

@@ -13,7 +13,7 @@
 #define CHUNK 2048   /* samples that are asked together; what is said of them stays in the cache */
 #define MOST_ROUTES 512
 
-/* As `front_to_back.py: scene_of` fills it. */
+/* As `front_to_back.py: in_c` fills it. */
 typedef struct {
     const float *scales, *resolutions, *table, *center;
     const float *const *gate, *const *field, *const *color;

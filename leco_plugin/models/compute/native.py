@@ -81,16 +81,10 @@ def suits(*tensors: Tensor) -> bool:
     return known and has_native()
 
 
-def learns(*tensors: Tensor) -> bool:
-    """Whether networks may learn in C: somebody wants a gradient, and no products in halves."""
-    graph = torch.is_grad_enabled() and any(one.requires_grad for one in tensors)
-    return graph and not torch.is_autocast_enabled("cpu") and suits(*tensors)
-
-
-def answers_without_graph(*tensors: Tensor) -> bool:
-    """Whether networks may be asked in C: nobody wants a gradient, or the products in halves."""
-    graph = torch.is_grad_enabled() and any(one.requires_grad for one in tensors)
-    return not graph and not torch.is_autocast_enabled("cpu") and suits(*tensors)
+def suits_networks(*tensors: Tensor) -> bool:
+    """Whether networks may be asked in C, and learn: as `suits`, and nobody wants products in
+    halves."""
+    return not torch.is_autocast_enabled("cpu") and suits(*tensors)
 
 
 def hash_sums(positions: Tensor, resolutions: Tensor, table: Tensor, corners: int) -> Tensor:
