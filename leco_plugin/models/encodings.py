@@ -87,14 +87,8 @@ PRIMES = (1, 2654435761 - 2**32, 805459861)
 
 
 def sum_by_row(rows: Tensor, weights: Tensor, gradient: Tensor, size: int) -> Tensor:
-    """Gradient [size, features] of a table after weighted sums of its rows, on a CPU.
-
-    Args:
-        rows: [M, K] int32, of the table.
-        weights: [M, K].
-        gradient: [M, features], of the sums.
-        size: rows of the table.
-    """
+    """Gradient [size, features] of a table from that [M, features] of weighted sums of its rows
+    [M, K] int32, on a CPU; weights [M, K]."""
     flat = rows.flatten()
     columns = [
         torch.bincount(flat, (weights * column[:, None]).flatten(), minlength=size)

@@ -220,13 +220,8 @@ class HMoEField(nn.Module):
         self.projection = nn.Linear(self.encoding.out_dim, width)
         self.experts = HMoE(config.experts)
         self.density_head = nn.Linear(width, 1)
-        self.color = ColorHead(
-            width,
-            config.color_width,
-            config.direction_octaves,
-            config.appearance_dim,
-            num_images,
-        )
+        of_ray = config.direction_octaves, config.appearance_dim
+        self.color = ColorHead(width, config.color_width, *of_ray, num_images)
 
     def density(self, mapped: Tensor, routes: Tensor, gate_values: Tensor) -> tuple[Tensor, Tensor]:
         """Density and the features that colour is made of.

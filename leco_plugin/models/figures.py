@@ -66,12 +66,7 @@ def gate_pictures(met: Shaded, ray_indices: Tensor) -> dict[str, Tensor]:
 @torch.no_grad()
 def leading_expert(met: Shaded, ray_indices: Tensor, experts: int) -> Tensor:
     """The expert in [0, experts) with the greatest weight along each ray: [R, 1] int64, or `NONE`.
-
-    Args:
-        met: without the weight of backdrops.
-        ray_indices: [M] int64.
-        experts: of which `routes` are numbers.
-    """
+    `met` is without the weight of backdrops."""
     sums = met.weights.new_zeros(len(met.rgb) * experts)
     sums.index_add_(0, ray_indices * experts + met.routes, met.weights)
     expert = sums.view(-1, experts).argmax(dim=-1, keepdim=True)

@@ -150,7 +150,9 @@ def shade_natively(scene: Scene, rays: Rays, intervals: Intervals) -> tuple[Shad
         "sigmas": torch.empty_like(t_starts),
         "logits": t_starts.new_empty(len(t_starts), outputs),
     }
-    asked = native.front_to_back(
+    asked = native.call_along_rays(
+        "front_to_back",
+        starts,
         in_c(scene),
         {
             "origins": rays.origins.contiguous(),

@@ -85,26 +85,22 @@ def _logits(frozen: FoldedGate, features: Tensor, gate: Gate) -> Tensor:
     """How far scene experts lie above emptiness: features [N, width] to float32 [n, N]."""
     count, width = features.shape
     sums = features.new_empty(len(frozen.head), count, dtype=torch.float32)
-    lengths = sums.new_empty(count if gate.config.normed else 0)
+    lengths = sums.new_empty(count)
     rows_at_once = max(1, UNITS_AT_ONCE * torch.get_num_threads() // width)
     for first in range(0, count, rows_at_once):
         part = slice(first, first + rows_at_once)
-        _last_layer(frozen, features[part].float(), sums[:, part], lengths[part])
+        some = features[part].float()
+        if gate.config.normed:
+            torch.mm(frozen.head, some.T, out=sums[:, part])
+            torch.linalg.vector_norm(some, dim=1, out=lengths[part])
+        else:
+            torch.addmm(frozen.shift, frozen.head, some.T, out=sums[:, part])
     if not gate.config.normed:
         return sums
     above, mean = sums[:-1], sums[-1]
     square = lengths.square_().addcmul_(mean, mean, value=-1.0)
     square.clamp_(min=0.0).add_(width * gate.norm.eps)
     return torch.addcmul(frozen.shift, above, square.rsqrt_())
-
-
-def _last_layer(frozen: FoldedGate, features: Tensor, sums: Tensor, lengths: Tensor) -> None:
-    """Fill in the products of the head with features [N, width], and their lengths if asked for."""
-    if lengths.numel():
-        torch.mm(frozen.head, features.T, out=sums)
-        torch.linalg.vector_norm(features, dim=1, out=lengths)
-    else:
-        torch.addmm(frozen.shift, frozen.head, features.T, out=sums)
 
 
 def _occupancy(logits: Tensor) -> Tensor:

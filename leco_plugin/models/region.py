@@ -230,13 +230,8 @@ def cut_rays(
 
 
 def with_ends_for_all(rays: Rays, far: Tensor, length: Tensor) -> Rays:
-    """Gives rays that miss the bounds a piece as long as a backdrop at the far end: their sky.
-
-    The piece of a ray without a backdrop has no length.
-
-    Args:
-        far, length: scalars, scene units.
-    """
+    """Gives rays that miss the bounds a piece as long as a backdrop at the far end: their sky. The
+    piece of a ray without a backdrop has no length."""
     missed = ~(rays.t_maxs > rays.t_mins)
     starts = far - length
     starts = starts if rays.cut_off is None else torch.where(rays.cut_off, far, starts)

@@ -168,11 +168,8 @@ def with_backdrop(
     numbers = torch.arange(num_rays, device=inside.device)
     last_slots = counts.cumsum(0) + numbers
     merged = []
-    for of_samples, of_rays in (
-        (ray_indices, numbers),
-        (t_starts, starts),
-        (t_ends, rays.t_maxs),
-    ):
+    pairs = (ray_indices, numbers), (t_starts, starts), (t_ends, rays.t_maxs)
+    for of_samples, of_rays in pairs:
         together = of_samples.new_empty(len(inside) + num_rays)
         together[slots], together[last_slots] = of_samples, of_rays.to(of_samples.dtype)
         merged.append(together)
@@ -272,11 +269,7 @@ def render(
 
 
 def weigh(
-    sigmas: Tensor,
-    is_backdrop: Tensor,
-    intervals: Intervals,
-    half_extent: Tensor,
-    num_rays: int,
+    sigmas: Tensor, is_backdrop: Tensor, intervals: Intervals, half_extent: Tensor, num_rays: int
 ) -> tuple[Tensor, Tensor]:
     """Rendering weights of packed intervals [M] and where each ray has them [R, 2].
 
@@ -288,12 +281,8 @@ def weigh(
     packed_info = pack_info(intervals.ray_indices, num_rays)
     # for the weights only: what the field says of the place stays the field's
     absorbing = torch.where(is_backdrop, sigmas + OPAQUE, sigmas)
-    weights, _, _ = render_weight_from_density(
-        intervals.t_starts / half_extent,
-        intervals.t_ends / half_extent,
-        absorbing,
-        packed_info=packed_info,
-    )
+    edges = intervals.t_starts / half_extent, intervals.t_ends / half_extent
+    weights, _, _ = render_weight_from_density(*edges, absorbing, packed_info=packed_info)
     return weights, packed_info
 
 
@@ -322,12 +311,8 @@ def sum_up(weights: Tensor, rays: Rays, intervals: Intervals) -> tuple[Tensor, T
     Depth is that of what is met, so that a leaf half transparent is not moved towards the sky.
     """
     middles = 0.5 * (intervals.t_starts + intervals.t_ends)
-    sums = accumulate_along_rays(
-        weights,
-        torch.stack([torch.ones_like(middles), middles], dim=-1),
-        intervals.ray_indices,
-        len(rays.origins),
-    )
+    values = torch.stack([torch.ones_like(middles), middles], dim=-1)
+    sums = accumulate_along_rays(weights, values, intervals.ray_indices, len(rays.origins))
     accumulation, distance = sums[:, 0], sums[:, 1]
     return accumulation, mean_distance(accumulation, distance, rays)
 

@@ -193,34 +193,15 @@ def field_densities(
     return hidden, raw
 
 
-def front_to_back(scene: Values, batch: Values) -> list[slice]:
-    """Renders rays from the front into the tensors of a batch.
-
-    Args:
-        scene, batch: what the structures `Scene` and `Batch` of `front_to_back.c` hold, in the same
-            order; tensors are contiguous.
-    Returns:
-        Where in the tensors of samples those lie that were asked, in the order of the rays.
-    """
-    return _of_rays("front_to_back", (scene, batch), batch["starts"])
-
-
-def march_cells(march: Values) -> list[slice]:
-    """Packs candidates that cells keep or leave open into the tensors of a march.
-
-    Args:
-        march: what the structure `March` of `march.c` holds, in the same order.
-    Returns:
-        Where in the tensors of samples they lie, in the order of the rays.
-    """
-    return _of_rays("march_cells", (march,), march["rooms"])
-
-
-def _of_rays(name: str, given: Sequence[Values], rooms: Any) -> list[slice]:
-    """Calls a routine on parts of a batch of rays.
+def call_along_rays(name: str, rooms: Tensor, *given: Values) -> list[slice]:
+    """Calls a routine on parts of a batch of rays: `front_to_back`, or `march_cells`.
 
     Args:
         rooms: [R] int64, where the samples of each ray have room.
+        given: what the structures hold that the routine is given, in the same order; tensors are
+            contiguous.
+    Returns:
+        Where in the tensors of samples those lie that the routine wrote, in the order of the rays.
     """
     routine = routine_of(name)
     routine.restype = ctypes.c_int64  # type: ignore[attr-defined]

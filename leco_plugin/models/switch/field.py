@@ -124,13 +124,8 @@ class SwitchField(nn.Module):
             Expert(config.width, config.layers, config.skip) for _ in range(config.experts)
         )
         self.density_head = nn.Linear(config.width, 1)
-        self.color = ColorHead(
-            config.width,
-            config.color_width,
-            config.direction_octaves,
-            config.appearance_dim,
-            num_images,
-        )
+        of_ray = config.direction_octaves, config.appearance_dim
+        self.color = ColorHead(config.width, config.color_width, *of_ray, num_images)
 
     def forward(
         self, mapped: Tensor, noise: float = 0.0, capacity_factor: float | None = None

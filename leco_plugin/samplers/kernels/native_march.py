@@ -79,12 +79,15 @@ def _march(cache: CellCache, candidates: Candidates) -> tuple[Samples, Tensor]:
         "open": torch.empty(total, dtype=torch.bool),
     }
     coarse, _, first_plane, planes, clearance = cache.tables()
-    found = native.march_cells(
+    rooms = room.cumsum(0) - room
+    found = native.call_along_rays(
+        "march_cells",
+        rooms,
         {
             "coordinates": coordinates.contiguous(),
             "numbers": torch.stack([t_mins, first.expand_as(counts), counts, *switches]),
             "powers": growth_table(step_size, cone_angle, t_mins.device) if growing else None,
-            "rooms": room.cumsum(0) - room,
+            "rooms": rooms,
             "coarse": coarse,
             "first_plane": first_plane,
             "bricks": cache.bricks,
@@ -98,7 +101,7 @@ def _march(cache: CellCache, candidates: Candidates) -> tuple[Samples, Tensor]:
             "resolution": cache.resolution,
             "contracted": int(cache.contracted),
             "wide": int(coarse.dtype == torch.int32),
-        }
+        },
     )
     *kept, left_open = (torch.cat([each[part] for part in found]) for each in samples.values())
     ray_indices, t_starts, t_ends = kept
