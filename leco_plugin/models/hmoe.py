@@ -139,9 +139,9 @@ class HMoE(nn.Module):
         empty, *scene = self.experts
         if may_group(features, len(scene), self.config.width):
             hidden = self._grouped(features, routes)
-            return hidden * gate_values[:, None].to(hidden.dtype)
-        experts = [None if self.config.empty_expert == "none" else empty, *scene]
-        hidden = dispatch(features, routes, experts)
+        else:
+            experts = [None if self.config.empty_expert == "none" else empty, *scene]
+            hidden = dispatch(features, routes, experts)
         return hidden * gate_values[:, None].to(hidden.dtype)
 
     def _grouped(

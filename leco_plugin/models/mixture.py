@@ -117,11 +117,7 @@ class Mixture(nn.Module):
             return (gate or self.small or self.gate).occupancy(mapped)
 
     def set_bounds(self, bounds: SceneBounds, median_length: float) -> None:
-        """Fixes the region and the marches.
-
-        Args:
-            median_length: median length of rays inside the bounds, scene units.
-        """
+        """Fixes the region and the marches; see `marching_rule`."""
         self.region.set(bounds)
         for number, candidates in enumerate((self.sizes.candidates, self.sizes.learn_candidates)):
             rule = marching_rule(bounds.kind, bounds.near, bounds.far, candidates, median_length)

@@ -175,12 +175,8 @@ class SeenBackdrops(nn.Module):
 
     @torch.no_grad()
     def note(self, cut: Rays, beyond: Tensor) -> None:
-        """Notes rays of training images.
-
-        Args:
-            cut: to the region.
-            beyond: bool [R], which of them show what lies beyond the scene.
-        """
+        """Notes rays of training images, cut to the region; those of `beyond`, bool [R], show what
+        lies beyond the scene."""
         missed, heights = cut.t_maxs <= cut.t_mins, cut.directions[:, 2]
         cells, limits = cells_of(cut.directions), torch.full_like(self.limits, -2.0)
         for number, (which, z) in enumerate(product((~missed, missed), (heights, -heights))):
@@ -255,13 +251,10 @@ def within_crop(rays: Rays, nears: Tensor | None, fars: Tensor | None) -> Rays:
 def marching_rule(
     kind: SpaceKind, near: float, far: float, candidates: int, median_length: float
 ) -> tuple[float, float]:
-    """Step size and cone angle with which a ray has about so many candidates.
+    """Step size and cone angle with which a ray has about so many candidates, from where rays begin
+    and end and their median length inside the bounds, all in scene units.
 
     A box is marched evenly; an unbounded scene in steps that grow with distance.
-
-    Args:
-        near, far: where rays begin and end, scene units.
-        median_length: median length of rays inside the bounds, scene units.
     """
     if kind == "box":
         return median_length / candidates, 0.0

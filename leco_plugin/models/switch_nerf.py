@@ -48,13 +48,8 @@ from leco_plugin.studio.checkpoints import prepare_checkpoints
 
 
 def scene_grid(space: Space, aabb: Tensor, resolution: int, levels: int) -> OccupancyGridEstimator:
-    """An empty grid, whose innermost box is what the space maps without contraction.
-
-    Args:
-        aabb: [6] corners of the box in which rays are marched; the grid ends there too.
-        resolution: cells along each axis.
-        levels: nested boxes; a bounded scene needs one.
-    """
+    """An empty grid, whose innermost box is what the space maps without contraction; it ends where
+    the box [6] does in which rays are marched. A bounded scene needs one level."""
     low, high = aabb.view(2, 3)
     low = low.maximum(space.center - space.half_extent)
     high = high.minimum(space.center + space.half_extent)
@@ -138,12 +133,7 @@ class SwitchNerfModel(Model):
 
     @torch.no_grad()
     def set_bounds(self, bounds: SceneBounds, median_length: float) -> None:
-        """Fixes the space mapping, the marching rule and the grid's box.
-
-        Args:
-            bounds: of the scene.
-            median_length: median length of rays inside the bounds, scene units.
-        """
+        """Fixes the space mapping, the marching rule (see `marching_rule`) and the grid's box."""
         self.region.set(bounds)
         candidates = self.config.sizes.candidates
         rule = marching_rule(bounds.kind, bounds.near, bounds.far, candidates, median_length)

@@ -69,10 +69,6 @@ class _Select(torch.autograd.Function):
         return whole.index_copy_(0, ctx.chosen, gradient), None
 
 
-Expert = Callable[[Tensor], Tensor]
-"""Features [M, width] to [M, width]."""
-
-
 class Places:
     """Where rows go that are sorted by keys [N] int64, each key's rows up to a steady size."""
 
@@ -121,13 +117,15 @@ class _PutBack(torch.autograd.Function):
         return placed, None
 
 
-def dispatch(features: Tensor, routes: Tensor, experts: Sequence[Expert | None]) -> Tensor:
+def dispatch(
+    features: Tensor, routes: Tensor, experts: Sequence[Callable[[Tensor], Tensor] | None]
+) -> Tensor:
     """Applies the experts, each to the points that are routed to it.
 
     Args:
         features: [N, width].
         routes: [N] int64, numbers of experts.
-        experts: None stands for one that answers zero.
+        experts: features [M, width] to as many; None stands for one that answers zero.
     Returns:
         [N, width] in the dtype of the last expert that has points.
     """

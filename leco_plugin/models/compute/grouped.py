@@ -7,13 +7,16 @@ import logging
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from typing import Protocol, cast
+from typing import TYPE_CHECKING, cast
 
 import torch
 from torch import Tensor, nn
 
 from leco_plugin.models.compute.dispatch import permute_rows
 from leco_plugin.samplers.kernels import kernels_off
+
+if TYPE_CHECKING:
+    from leco_plugin.models.hmoe import Expert
 
 Product = Callable[[Tensor, Tensor], Tensor]
 
@@ -48,7 +51,7 @@ def is_grouping_faster(device: torch.device, n: int, width: int) -> bool:
     return grouped <= plain
 
 
-def is_right(device: torch.device, dtype: torch.dtype = torch.bfloat16) -> bool:
+def is_right(device: torch.device) -> bool:
     """Whether grouped products, forward and backward, are those of each group by itself.
 
     The trial has what routes have: a group of an odd size, one without rows, and rows in no group.
@@ -57,7 +60,7 @@ def is_right(device: torch.device, dtype: torch.dtype = torch.bfloat16) -> bool:
     count, n = sum(sizes) + beyond, len(sizes)
     rows = torch.linspace(-1.0, 1.0, count * width, device=device).view(count, width)
     matrices = torch.linspace(1.0, -1.0, n * width**2, device=device).view(n, width, width)
-    given, ends = (rows.to(dtype), matrices.to(dtype)), _ends(sizes, device)
+    given, ends = (rows.bfloat16(), matrices.bfloat16()), _ends(sizes, device)
 
     def answers(product_of: Product) -> list[Tensor]:
         points, weights = (value.clone().requires_grad_() for value in given)
@@ -126,15 +129,7 @@ def _wait(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
-class Layered(Protocol):
-    """What is asked of an expert: `hmoe.Expert`."""
-
-    layers: nn.ModuleList
-    skip: int | None
-    residual: bool
-
-
-def grouped_dispatch(features: Tensor, routes: Tensor, experts: Sequence[Layered]) -> Tensor:
+def grouped_dispatch(features: Tensor, routes: Tensor, experts: Sequence[Expert]) -> Tensor:
     """Each point through the expert that it is routed to.
 
     Args:
