@@ -268,9 +268,8 @@ class Occupancy(nn.Module):
             cells = None if seen is None else cells_from_bytes(seen)
         except ValueError as error:
             raise ValueError(f"{path}: tensor {SEEN!r} is damaged: {_line(error)}") from None
-        if header.get("sha256") != _digest(
-            header, tensors if seen is None else tensors | {SEEN: seen}
-        ):
+        stored = tensors if seen is None else tensors | {SEEN: seen}
+        if header.get("sha256") != _digest(header, stored):
             raise ValueError(f"{path} is damaged: its contents do not match its checksum")
         report = report if isinstance(report, dict) else {}
         occupancy = cls(Gate(config), Space(), 0.0, cast(Precision, precision), report).float()

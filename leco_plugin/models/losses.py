@@ -222,8 +222,7 @@ def require_finite(
         outputs: of the batch; where they hold `rays` and `shaded`, these are suspects too.
         image: what the batch was compared with.
     """
-    name = first_non_finite(losses)
-    if name is not None:
+    if name := first_non_finite(losses):
         raise FloatingPointError(explain_non_finite(name, model, outputs, image))
 
 

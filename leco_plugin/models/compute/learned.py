@@ -41,11 +41,7 @@ def _layers(parts: Parts) -> list[Tensor | None]:
 
 
 class _Sums:
-    """Room for the gradients of parts, of each thread by itself.
-
-    Args:
-        parts: weights, biases and other vectors; None has no gradient.
-    """
+    """Room for the gradients of weights, biases and other vectors, of each thread by itself."""
 
     def __init__(self, parts: Parts) -> None:
         self.parts = parts
@@ -75,11 +71,12 @@ class _Sums:
 
 
 def _run(
-    name: str, sums: _Sums, call: Callable[[Any, list[Tensor | None], int, int], int], count: int
+    name: str, parts: Parts, call: Callable[[Any, list[Tensor | None], int, int], int], count: int
 ) -> list[Tensor | None]:
-    """Calls a routine on parts of its points; returns the gradients of its parts."""
-    routine = native.routine_of(name)
-    failed = []
+    """Calls a routine on some of its points at a time; returns the gradients of weights and biases,
+    None for a part that is None."""
+    routine, sums = native.routine_of(name), _Sums(parts)
+    failed: list[int] = []
 
     def work(begin: int, end: int) -> None:
         failed.append(call(routine, sums.of(begin), begin, end))
@@ -109,18 +106,17 @@ class GateLogits(torch.autograd.Function):
         norm = parts[-4:-2]
         of_norm = [_padded(each[None])[0].contiguous() for each in norm]
         whole = [*_layers(parts[:-4]), *of_norm, *_layers(parts[-2:])]
-        given_parts = native.addresses_of(whole)
-        pointers = native.pointers_to(mapped, scales)
+        read = *native.pointers_to(mapped, scales), native.addresses_of(whole)
         strides = ctypes.c_int64(mapped.stride(1)), ctypes.c_int64(mapped.stride(0))
         sizes = len(scales), ctx.fresh, layers, width, given.shape[-1], ctypes.c_float(ctx.epsilon)
 
         def call(routine: Any, found: list[Tensor | None], begin: int, end: int) -> int:
             part = ctypes.c_int64(begin), ctypes.c_int64(end), *strides
             places = *native.pointers_to(given), native.addresses_of(found)
-            made: int = routine(*pointers, given_parts, *places, *part, *sizes)
+            made: int = routine(*read, *places, *part, *sizes)
             return made
 
-        found = _run("gate_gradients", _Sums(parts), call, len(mapped))
+        found = _run("gate_gradients", parts, call, len(mapped))
         return (None, None, None, None, *found)
 
 
@@ -144,22 +140,22 @@ class FieldDensities(torch.autograd.Function):
         features, order, routes, factors, *parts = ctx.saved_tensors
         of_features, of_factors = torch.empty_like(features), torch.empty_like(factors)
         kept = _layers(parts)
-        whole = native.addresses_of(kept)
-        read = native.pointers_to(features, order, routes, factors)
+        points = native.pointers_to(features, order, routes, factors)
         given = of_hidden.contiguous(), of_raw.contiguous()
         rest = native.pointers_to(*given, of_features, of_factors)
+        read = *points, native.addresses_of(kept), *rest
         sizes = features.shape[-1], len(parts[1]), ctx.layers
 
         def call(routine: Any, found: list[Tensor | None], begin: int, end: int) -> int:
             part = ctypes.c_int64(begin), ctypes.c_int64(end)
-            made: int = routine(*read, whole, *rest, native.addresses_of(found), *part, *sizes)
+            made: int = routine(*read, native.addresses_of(found), *part, *sizes)
             return made
 
         asked, each = set(routes.unique().tolist()), 2 * ctx.layers
         for expert in range((len(parts) - 4) // each):
             if expert not in asked:  # no gradient, rather than one of zeros that Adam acts on
                 parts[4 + each * expert : 4 + each * (expert + 1)] = [None] * each
-        found = _run("field_gradients", _Sums(parts), call, len(order))
+        found = _run("field_gradients", parts, call, len(order))
         return (of_features, None, of_factors, None, *found)
 
 
@@ -220,7 +216,7 @@ class Colors(torch.autograd.Function):
             made: int = routine(*read, *places, native.addresses_of(found), *sizes)
             return made
 
-        found = _run("color_gradients", _Sums(parts), call, len(of_rays))
+        found = _run("color_gradients", parts, call, len(of_rays))
         return (of_hidden, of_weights, None, None, of_of_rays, *found)
 
 

@@ -18,11 +18,7 @@ T = TypeVar("T")
 
 def is_distributed() -> bool:
     """Whether the run has several processes."""
-    return (
-        distributed.is_available()
-        and distributed.is_initialized()
-        and distributed.get_world_size() > 1
-    )
+    return distributed.is_initialized() and distributed.get_world_size() > 1
 
 
 def is_first() -> bool:
