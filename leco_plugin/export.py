@@ -37,8 +37,8 @@ from leco_plugin.export_surface import (
     MOST_CELLS,
     KeptSurface,
     Progress,
-    comments_of,
     finest,
+    in_comments,
     kept_surface,
     photograph_colours,
     require_few,
@@ -149,14 +149,16 @@ def _export_points(
         facts = write_splat_init(occupancy, surface.positions, back, description, out)
         return facts | {"frame": "data"}
     colours = None
-    if back is not None:
+    earth: dict[str, Any] = {}
+    if back is not None and description is not None:
         colours = photograph_colours(description, surface.positions.numpy())
-    write_ply(surface, out, colours, comments_of(description) if back is not None else [])
+        earth = georeference(description)
+    write_ply(surface, out, colours, in_comments(earth))
     return {
         "points": len(surface.positions),
         "frame": "run" if back is None else "data",
         "photograph_colours": colours is not None,
-        **({} if back is None or description is None else georeference(description)),
+        **earth,
     }
 
 
@@ -189,10 +191,10 @@ def _export_volume(
 def _export_grid(
     occupancy: Occupancy, out: Path, resolution: int, levels: int | None
 ) -> dict[str, Any]:
-    """Writes an occupancy grid of nerfacc."""
+    """Writes an occupancy grid of nerfacc, which `torch.load(..., weights_only=True)` reads."""
     with bar(f"Asking the gate about {resolution}^3 cells a level") as show:
         buffers = grid_buffers(occupancy, resolution, levels, show)
-    write_grid(buffers, out)
+    write_whole(out, lambda file: torch.save(buffers, file))
     return {
         "frame": "run",
         "levels": len(buffers["aabbs"]),
@@ -270,15 +272,6 @@ def reaching_levels(occupancy: Occupancy) -> int:
     return min(max(1 + math.ceil(math.log2(max(widest, 1.0))), 2), MOST_LEVELS)
 
 
-def write_grid(buffers: dict[str, Tensor], path: Path) -> None:
-    """Writes the buffers as `torch.save` does; `torch.load(..., weights_only=True)` reads them.
-
-    Raises:
-        OSError: it cannot be written there.
-    """
-    write_whole(path, lambda file: torch.save(buffers, file))
-
-
 def _largest_in_cells(occupancy: Occupancy, box: Tensor, resolution: int) -> Iterator[Tensor]:
     """The largest o(x) probed in each cell of a box, some layers [k, n, n] at a time."""
     low, high = box[:3], box[3:]
@@ -332,9 +325,12 @@ def export_folder(
     cells = default_resolution(occupancy, "ply") if resolution is None else resolution
     surface = functools.cache(lambda: surface_of(occupancy, cells))
 
-    def exported(format: Format, name: str) -> Facts:
-        known = None if format == "npz" else surface()
-        return export(file, format, folder / name, resolution, data=data, surface=known)
+    def exported(name: str, format: Format, use: Callable[[Facts], str]) -> Part:
+        def write() -> Facts:
+            known = None if format == "npz" else surface()
+            return export(file, format, folder / name, resolution, data=data, surface=known)
+
+        return _part(folder, name, write, use)
 
     def drawn() -> Facts:
         colours = scene_colours(occupancy, description)
@@ -342,21 +338,22 @@ def export_folder(
         write_page(occupancy, folder / "occupancy.html", colours)
         return {"photograph_colours": colours is not None}
 
-    splats, part = folder / "splats.json", functools.partial(_part, folder)
+    splats = folder / "splats.json"
+    picture = "slices of o(x), and the kept points"
     parts = [
-        part("occupancy.png", drawn, lambda facts: "slices of o(x), and the kept points"),
-        part("kept.ply", lambda: exported("ply", "kept.ply"), _points_in_words),
-        part(
+        _part(folder, "occupancy.png", drawn, lambda facts: picture),
+        exported("kept.ply", "ply", _points_in_words),
+        exported(
             splats.name,
-            lambda: exported("splat-init", splats.name),
+            "splat-init",
             lambda facts: (
                 f"{facts['points']:,} points in splats.ply, to start splats from: "
                 f"ns-train splatfacto --data {shlex.quote(str(splats))} leco-photographs (on a GPU)"
             ),
         ),
-        part(
+        exported(
             "volume.npz",
-            lambda: exported("npz", "volume.npz"),
+            "npz",
             lambda facts: f"o(x) in {' x '.join(map(str, facts['shape']))} cells, for NumPy",
         ),
     ]

@@ -134,14 +134,9 @@ def _at(axes: Sequence[Tensor], chosen: Tensor) -> Tensor:
 def _first_met(
     occupancy: Occupancy, places: Tensor, cameras: Tensor, cell: float, steps: int
 ) -> Tensor:
-    """Whether rays from the nearest camera meet matter at mapped places [K, 3], and not before:
-    bool [K].
-
-    Args:
-        cameras: [C, 3] scene units.
-        cell: mapped size of a cell.
-        steps: cells before and behind a place that are asked.
-    """
+    """Whether rays from the nearest camera [C, 3] (scene units) meet matter at mapped places
+    [K, 3], and not before: bool [K]. So many `steps` of a cell's mapped size before and behind a
+    place are asked."""
     from scipy.spatial import KDTree
 
     eyes = occupancy.space.map(cameras.to(occupancy.threshold_value.device)).cpu()
@@ -164,11 +159,7 @@ def _unmap(occupancy: Occupancy, mapped: Tensor) -> Tensor:
 
 def shown_part(surface: KeptSurface, back: Tensor | None, description: Path | None) -> KeptSurface:
     """Of a surface in the coordinates of a run, what `SHOWN_BY` photographs may show; all of it
-    where it is not known what they show.
-
-    Raises:
-        ValueError: that is none of it.
-    """
+    where it is not known what they show. ValueError if that is none of it."""
     if back is None or description is None:
         return surface
     views = views_of(description, moved(surface.positions.double(), back).numpy())
@@ -203,14 +194,8 @@ def write_ply(
     colours: np.ndarray | None = None,
     comments: Sequence[str] = (),
 ) -> None:
-    """Writes binary PLY of float64 with a colour for each point.
-
-    Args:
-        colours: [P, 3] uint8; None colours by o(x).
-        comments: lines for its head.
-    Raises:
-        OSError: it cannot be written there.
-    """
+    """Writes binary PLY of float64 with colours [P, 3] uint8, by o(x) where they are None, and with
+    comments in its head. OSError if it cannot be written there."""
     from matplotlib import colormaps
 
     rows = np.empty(len(surface.values), dtype=[("xyz", "<f8", 3), ("rgb", "u1", 4)])
@@ -224,42 +209,30 @@ def write_ply(
 
 PATHS = ("file_path", "mask_path", "depth_file_path")
 """Keys of a frame of transforms.json that name files."""
-LAYERS_AT_ONCE = 1 << 20
 
 
-def comments_of(description: Path | None) -> list[str]:
-    """Lines for the head of a PLY file: where on earth its coordinates lie, if that is known."""
-    if description is None:
-        return []
-    known = georeference(description)
-    return [f"{name} {json.dumps(value)}" for name, value in known.items()]
+def in_comments(earth: dict[str, Any]) -> list[str]:
+    """Lines for the head of a PLY file, of a `georeference`."""
+    return [f"{name} {json.dumps(value)}" for name, value in earth.items()]
 
 
 def photograph_colours(
-    description: Path | None, positions: NDArray[np.float64]
+    description: Path, positions: NDArray[np.float64]
 ) -> NDArray[np.uint8] | None:
     """Colours [N, 3] of the sparse points nearest to positions [N, 3] in the data's coordinates;
-    None where the scene has no coloured points, or is not known."""
-    known = None if description is None else coloured_points(description)
+    None where the scene has no coloured points."""
+    known = coloured_points(description)
     return None if known is None else colours_near(known, positions)
 
 
 def write_splat_init(
     occupancy: Occupancy, surface: Tensor, back: Tensor, description: Path, out: Path
 ) -> dict[str, Any]:
-    """Writes points, and a copy of transforms.json that names them: where splatfacto starts.
-
-    The points are the scene's sparse points that the occupancy keeps, and the kept surface.
-
-    Args:
-        surface: [P, 3] of the kept surface, in the data's coordinates.
-        back: [3, 4] takes positions of the run to those of the data.
-        description: the scene's transforms.json.
-        out: the copy, beside the scene's own or elsewhere; the points lie beside it.
-    Raises:
-        InputError: the copy or its points would replace the scene's own, or the copy's name does
-            not end in .json.
-    """
+    """Writes points, and `out`, a copy of the scene's transforms.json (`description`) that names
+    them: where splatfacto starts. The points lie beside the copy: the scene's sparse points that
+    the occupancy keeps, and the kept surface [P, 3] in the data's coordinates. `back` [3, 4] takes
+    positions of the run to those. InputError if the copy or its points would replace the scene's
+    own, or the copy's name does not end in .json."""
     if out.suffix != ".json":
         raise InputError(f"--out {out}: a start for splats is a copy of transforms.json; end it so")
     points, meta = out.with_suffix(".ply"), load_json(description)
@@ -275,7 +248,7 @@ def write_splat_init(
         places, sparse = np.concatenate([known.positions[kept], places]), int(kept.sum())
     rows = np.zeros(len(places), dtype=[("xyz", "<f8", 3), ("rgb", "u1", 3)])
     rows["xyz"], rows["rgb"] = places, colours
-    write_points(points, rows, comments_of(description))
+    write_points(points, rows, in_comments(georeference(description)))
     copy = _from_elsewhere(meta, description.parent, out.parent)
     write_json(out, copy | {"ply_file_path": points.name}, indent=1, allow_nan=True)
     return {"points": len(places), "sparse_points": sparse, "photograph_colours": known is not None}
@@ -317,22 +290,19 @@ def write_volume(
     resolution: int,
     back: Tensor | None,
     out: Path,
-    on_progress: Callable[[float], None] = lambda share: None,
+    on_progress: Progress,
 ) -> dict[str, Any]:
     """Writes o(x) at the middles of cells of the box as a NumPy file.
 
     The file holds `o` float16 [X, Y, Z], `kept` and `seen` bool [X, Y, Z], `low` and `high` [3] of
     the box in the run's coordinates, `threshold`, and `to_data` [3, 4], which takes positions of
-    the run to those of the data. Of an unbounded scene the box is its inner cube.
-
-    Args:
-        resolution: cells along the longest side.
-        back: `to_data`; None leaves it out.
+    the run to those of the data, unless `back` is None. Of an unbounded scene the box is its inner
+    cube; `resolution` is the number of cells along the longest side.
     """
     box = whole_box(occupancy)
     counts = box.cells(resolution)
     x, y, z = (box.axis(number, count) for number, count in enumerate(counts))
-    layers = max(1, LAYERS_AT_ONCE // (counts[1] * counts[2]))
+    layers = max(1, CELLS_AT_ONCE // (counts[1] * counts[2]))
     values, seen = [], []
     for part in x.split(layers):
         positions = torch.stack(torch.meshgrid(part, y, z, indexing="ij"), dim=-1)

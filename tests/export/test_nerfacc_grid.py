@@ -8,7 +8,7 @@ import pytest
 import torch
 from ball_occupancy import CENTRE, RADIUS, ball
 
-from leco_plugin.export import grid_buffers, innermost_box, reaching_levels, write_grid
+from leco_plugin.export import export, grid_buffers, innermost_box, reaching_levels
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.boxes import lookup
 from leco_plugin.samplers.grid import OccupancyGridEstimator
@@ -28,7 +28,8 @@ def walled() -> Occupancy:
 
 def test_nerfacc_loads_it_and_sees_the_same_cells(tmp_path: Path) -> None:
     nerfacc = pytest.importorskip("nerfacc")
-    write_grid(grid_buffers(walled(), 16), tmp_path / "grid.pt")
+    walled().save(tmp_path / "occupancy.safetensors")
+    export(tmp_path / "occupancy.safetensors", "nerfacc-grid", tmp_path / "grid.pt", 16)
     loaded = torch.load(tmp_path / "grid.pt", weights_only=True)
     theirs = nerfacc.OccGridEstimator([0.0] * 3 + [1.0] * 3, resolution=16, levels=1)
     theirs.load_state_dict(loaded)
