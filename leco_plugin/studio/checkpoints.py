@@ -33,13 +33,8 @@ _FLOAT64_SCALAR: list[Any] = [
 
 
 def allow_checkpoint_globals() -> None:
-    """Allows `torch.load` to read float64 numpy scalars, and nothing else, in this process.
-
-    Older releases of torch load nerfstudio's checkpoints as they are, and do not take names beside
-    their list's entries.
-    """
-    if torch.__version__ >= "2.6":
-        torch.serialization.add_safe_globals(_FLOAT64_SCALAR)
+    """Allows `torch.load` to read float64 numpy scalars, and nothing else, in this process."""
+    torch.serialization.add_safe_globals(_FLOAT64_SCALAR)
 
 
 PREVIOUS = "previous"
@@ -180,9 +175,6 @@ def checkpoints_of(config: Any) -> Path:
     )
 
 
-EVAL_UTILS = "nerfstudio.utils.eval_utils"
-
-
 def prepare_checkpoints() -> None:
     """Has checkpoints of this process read safely and whole; every model of this package calls it
     when it is built, which is before nerfstudio loads one."""
@@ -192,7 +184,7 @@ def prepare_checkpoints() -> None:
 
 def evaluate_whole_checkpoints() -> None:
     """Has nerfstudio, where its loading of runs is imported, load the newest whole checkpoint."""
-    utils: Any = sys.modules.get(EVAL_UTILS)
+    utils: Any = sys.modules.get("nerfstudio.utils.eval_utils")
     if utils is None or hasattr(utils.eval_load_checkpoint, "__wrapped__"):
         return
     utils.eval_load_checkpoint = from_whole(utils.eval_load_checkpoint)

@@ -17,8 +17,6 @@ from leco_plugin.models.compute.ranks import mean
 
 MOST_GROWTH = 2.0
 """Factor by which a batch may grow from one step to the next; it shrinks as far as it must."""
-NOTHING_KEPT = 1
-"""Samples of a batch that has none."""
 FEWEST_RAYS, MOST_RAYS = 64, 1 << 16
 """Rays of the smallest and of the largest batch."""
 
@@ -49,8 +47,8 @@ class ClampedDynamicBatchPipeline(DynamicBatchPipeline):
 
     def _update_dynamic_num_rays_per_batch(self, num_samples_per_batch: int) -> None:
         samples = mean(float(num_samples_per_batch), self.device)
-        if samples <= NOTHING_KEPT:
-            return  # it says nothing about a batch in which something is kept
+        if samples <= 1:  # the fake one, which says nothing about a batch that keeps something
+            return
         factor = min(MOST_GROWTH, self.config.target_num_samples / samples)
         self._set_rays(round(self.dynamic_num_rays_per_batch * factor))
 
@@ -86,9 +84,8 @@ def clamped(pipeline: Any) -> Any:
     """The config of a pipeline of dynamic batches as one that keeps within bounds; any other as it
     is."""
     target = getattr(pipeline, "_target", None)
-    if not isinstance(target, type) or not issubclass(target, DynamicBatchPipeline):
-        return pipeline
-    if issubclass(target, ClampedDynamicBatchPipeline):
+    is_dynamic = isinstance(target, type) and issubclass(target, DynamicBatchPipeline)
+    if not is_dynamic or issubclass(target, ClampedDynamicBatchPipeline):
         return pipeline
     if type(pipeline) is DynamicBatchPipelineConfig and target is DynamicBatchPipeline:
         values = {f.name: getattr(pipeline, f.name) for f in fields(pipeline)}

@@ -13,14 +13,7 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator
-from contextlib import (
-    AbstractContextManager,
-    ExitStack,
-    closing,
-    contextmanager,
-    nullcontext,
-    suppress,
-)
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TextIO
@@ -54,13 +47,13 @@ def is_short(config: Any) -> bool:
     return not verbose and bool(config.logging.local_writer.enable)
 
 
-def short_screen(config: Any) -> AbstractContextManager[None]:
-    """While it lasts, only what the package says is on the screen of a run that has a short one."""
-    return _short(config.get_base_dir() / LOG) if is_short(config) else nullcontext()
-
-
 @contextmanager
-def _short(path: Path) -> Iterator[None]:
+def short_screen(config: Any) -> Iterator[None]:
+    """While it lasts, only what the package says is on the screen of a run that has a short one."""
+    if not is_short(config):
+        yield
+        return
+    path = config.get_base_dir() / LOG
     path.parent.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         plain: Any = stack.enter_context(closing(_Log(path)))
@@ -104,9 +97,6 @@ class _Log:
     def close(self) -> None:
         with suppress(OSError):
             self.file.close()
-
-    def isatty(self) -> bool:
-        return False
 
 
 def without_tables(config: Any) -> Any:
