@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -75,13 +75,8 @@ def swapped_config(
 
 
 def check_sampler(file: Path | None, sampler: str, options: Mapping[str, int | float]) -> None:
-    """Whether there is an occupancy, and a sampler with these options that asks gates of its kind.
-
-    Args:
-        file: an occupancy; None is one that will be learned.
-    Raises:
-        InputError: there is not.
-    """
+    """InputError unless there is an occupancy (None is one that will be learned), and a sampler
+    with these options that asks gates of its kind."""
     try:
         gate = LEARNING.sizes.gate if file is None else load_occupancy(file).gate.config
         check_gate(sampler, gate)
@@ -91,11 +86,8 @@ def check_sampler(file: Path | None, sampler: str, options: Mapping[str, int | f
 
 
 def registered(method: str) -> TrainerConfig:
-    """A copy of the config of a registered method, for the device that is there.
-
-    Raises:
-        InputError: there is no such method, or its package is not installed.
-    """
+    """A copy of the config of a registered method, for the device that is there. InputError if
+    there is no such method, or its package is not installed."""
     from nerfstudio.configs.method_configs import all_methods
 
     if method not in all_methods:
@@ -117,11 +109,8 @@ def with_sampler_swapped(
     other_scene: bool = False,
 ) -> TrainerConfig:
     """The same training with its model guided by an occupancy, learned first where there is no
-    file; the config given is not changed.
-
-    Raises:
-        InputError: the model learns or has an occupancy already, or there is no model.
-    """
+    file; the config given is not changed. InputError if the model learns or has an occupancy
+    already, or there is no model."""
     from leco_plugin.models.leco_config import LecoModelConfig
 
     pipeline: Any = copy.deepcopy(config.pipeline)
@@ -147,8 +136,7 @@ def with_sampler_swapped(
     if isinstance(parser, DataParserConfig):
         pipeline.datamanager.dataparser = with_checks(parser)
     if type(config) is TrainerConfig:
-        values = {f.name: getattr(config, f.name) for f in fields(config)}
-        config = DataParallelTrainerConfig(**values)
+        config = DataParallelTrainerConfig(**vars(config))
     trainer = AtomicTrainer if config._target is Trainer else config._target
     return replace(config, pipeline=clamped(pipeline), _target=trainer)
 
