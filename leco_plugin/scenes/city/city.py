@@ -127,19 +127,15 @@ class Faces:
         nearest = limits[:, :first].min(1, initial=np.inf)
         if first == len(candidates):
             return nearest
-        limits, others = limits[:, first:], candidates[first:]
-        nearest = np.minimum(nearest, self._measure(points, others[limits.argmin(1)]))
+        limits, others = limits[:, first:], self.triangles[candidates[first:] - self.first]
+        nearest = np.minimum(nearest, squared_to_triangles(points, others[limits.argmin(1)]))
         rows, columns = np.nonzero(limits < nearest[:, None])
         if len(rows):
             starts = np.flatnonzero(np.diff(rows, prepend=-1))
-            found = self._measure(points[rows], others[columns])
+            found = squared_to_triangles(points[rows], others[columns])
             touched = rows[starts]
             nearest[touched] = np.minimum(nearest[touched], np.minimum.reduceat(found, starts))
         return nearest
-
-    def _measure(self, points: Array, face: Indices) -> Array:
-        """Squared distance [M] from points [M, 3] to a triangle each, numbered by `face` [M]."""
-        return squared_to_triangles(points, self.triangles[face - self.first])
 
 
 def squared_to_triangles(points: Array, triangles: Array) -> Array:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -99,9 +98,9 @@ def picture_sizes(dataset: Any) -> Tensor:
 def _name(dataset: Any, number: int) -> str:
     """Another picture, or the same one read otherwise, has another name."""
     outputs = outputs_of(dataset)
-    paths: Iterable[Path] = [outputs.image_filenames[number]]
+    paths = [outputs.image_filenames[number]]
     if outputs.mask_filenames is not None:
-        paths = [*paths, outputs.mask_filenames[number]]
+        paths.append(outputs.mask_filenames[number])
     of_files = [(str(path), os.stat(path).st_mtime_ns, os.stat(path).st_size) for path in paths]
     alpha = None if outputs.alpha_color is None else torch.as_tensor(outputs.alpha_color).tolist()
     text = repr((of_files, dataset.scale_factor, alpha))
@@ -111,8 +110,8 @@ def _name(dataset: Any, number: int) -> str:
 def _decode(dataset: Any, number: int, size: list[int], files: dict[str, list[Path]]) -> None:
     source = dataset.image_filenames[number]
     data = dataset.get_data(number, image_type="uint8")
-    if list(data["image"].shape[:2]) != size:
-        height, width = data["image"].shape[:2]
+    height, width = data["image"].shape[:2]
+    if [height, width] != size:
         raise InputError(
             f"{source} has {width} x {height} pixels, its camera {size[1]} x {size[0]}"
         )
