@@ -58,18 +58,13 @@ def run_demo(
     quick: bool = False,
     began: float | None = None,
 ) -> dict[str, Any]:
-    """Writes `report.json`, `chart.png`, `picture.png`, the occupancy, the city and both runs.
+    """Writes `report.json`, `chart.png`, `picture.png`, the occupancy, the city and both runs into
+    the folder `out`, and returns the report. An earlier demo's city there is used again.
 
-    Args:
-        out: folder; an earlier demo's city in it is used again, its results are replaced.
-        seconds: training time of each run; by default `SECONDS`, or `QUICK_SECONDS`.
-        quick: a city of one block in small pictures.
-        began: `time.monotonic()` when the command began; by default now.
-    Returns:
-        The report, as `--out` has it.
-    Raises:
-        ValueError, OSError: the time is no positive number, or `out` cannot be used.
-        RuntimeError: the time was over before the occupancy was learned.
+    Each run trains for so many seconds, by default `SECONDS`, or `QUICK_SECONDS` of a `quick` demo
+    of one block. The command `began` at that `time.monotonic()`, by default now. ValueError or
+    OSError if the time is no positive number or `out` cannot be used; RuntimeError if the time was
+    over before the occupancy was learned.
     """
     command = "leco demo --quick" if quick else "leco demo"
     command += "" if seconds is None else f" --seconds {seconds:g}"

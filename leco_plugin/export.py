@@ -302,18 +302,11 @@ class Part(NamedTuple):
 def export_folder(
     file: Path, folder: Path, resolution: int | None = None, data: Path | None = None
 ) -> tuple[list[Part], list[str]]:
-    """Writes pictures, points, a start for splats and a volume.
+    """Writes pictures, points, a start for splats and a volume; arguments as of `export`.
 
-    Args:
-        file: an occupancy.
-        folder: made where it is missing; files of these names are replaced, and those of parts that
-            cannot be made are said to be old.
-        resolution: cells along the longest side; None as `export` has it.
-        data: the scene that it was learned on; None is that of the run in whose folder `file` lies.
-    Returns:
-        The parts, and two lines if the occupancy is of no use.
-    Raises:
-        ValueError, OSError: the file is no occupancy, or none of the parts can be written.
+    The folder is made where it is missing. Files of these names are replaced, and those of parts
+    that cannot be made are said to be old. Returns the parts, and two lines if the occupancy is of
+    no use. ValueError or OSError if the file is no occupancy, or no part can be written.
     """
     if folder.is_file():
         raise ValueError(f"--out {folder} is a file; without --format give a folder")
