@@ -34,7 +34,6 @@ from leco_plugin.evaluation.occupancy_page import write_page
 from leco_plugin.evaluation.occupancy_picture import draw
 from leco_plugin.export_surface import (
     CELLS,
-    MOST_CELLS,
     KeptSurface,
     Progress,
     finest,
@@ -107,7 +106,8 @@ def export(
     if format == "nerfacc-grid":
         facts = _export_grid(occupancy, out, resolution, levels)
     elif format == "npz":
-        facts = _export_volume(occupancy, out, resolution, back)
+        with bar(f"Asking the gate about cells of 1/{resolution}") as show:
+            facts = write_volume(occupancy, resolution, back, out, show)
     else:
         description = scene_of(occupancy, file, data)
         if description is not None:
@@ -173,19 +173,6 @@ def surface_of(occupancy: Occupancy, resolution: int) -> KeptSurface:
     """`kept_surface` with a progress bar."""
     with bar(f"Asking the gate about cells of 1/{resolution}") as show:
         return kept_surface(occupancy, resolution, show)
-
-
-def _export_volume(
-    occupancy: Occupancy, out: Path, resolution: int, back: Tensor | None
-) -> dict[str, Any]:
-    """Writes o(x) in cells."""
-    if resolution < 2:
-        raise ValueError(f"a volume takes at least 2 cells along a side, not {resolution}")
-    counts = whole_box(occupancy).cells(min(resolution, MOST_CELLS))
-    require_few(math.prod(counts), f"{resolution} along the longest side")
-    with bar(f"Asking the gate about cells of 1/{resolution}") as show:
-        facts = write_volume(occupancy, resolution, back, out, show)
-    return facts | {"frame": "run"}
 
 
 def _export_grid(

@@ -87,11 +87,8 @@ def kept_surface(
         ValueError: the resolution is below 2 or makes too many cells, nothing is kept, or no camera
             sees its surface.
     """
-    if resolution < 2:
-        raise ValueError(f"a surface takes at least 2 cells along a side, not {resolution}")
     box = mapped_box(occupancy)
-    counts = box.cells(min(resolution, MOST_CELLS))  # which are too many along one side alone
-    require_few(math.prod(counts), f"{resolution} along the longest side")
+    counts = _few_cells(box, resolution, "a surface")
     axes = [box.axis(number, count) for number, count in enumerate(counts)]
     cells, parts = math.prod(counts), []
     for first in range(0, cells, CELLS_AT_ONCE):
@@ -186,6 +183,16 @@ def require_few(cells: int, said: str) -> None:
             f"{said} are too many cells: an export has at most {MOST_CELLS} in all, as "
             f"{int(MOST_CELLS ** (1 / 3))}^3 are; give a smaller --resolution"
         )
+
+
+def _few_cells(box: ViewBox, resolution: int, what: str) -> tuple[int, int, int]:
+    """Cells along each axis of a box, so many along its longest side. ValueError if `what` cannot
+    have as few or as many."""
+    if resolution < 2:
+        raise ValueError(f"{what} takes at least 2 cells along a side, not {resolution}")
+    counts = box.cells(min(resolution, MOST_CELLS))  # which are too many along one side alone
+    require_few(math.prod(counts), f"{resolution} along the longest side")
+    return counts
 
 
 def write_ply(
@@ -300,7 +307,7 @@ def write_volume(
     cube; `resolution` is the number of cells along the longest side.
     """
     box = whole_box(occupancy)
-    counts = box.cells(resolution)
+    counts = _few_cells(box, resolution, "a volume")
     x, y, z = (box.axis(number, count) for number, count in enumerate(counts))
     layers = max(1, CELLS_AT_ONCE // (counts[1] * counts[2]))
     values, seen = [], []
@@ -324,5 +331,9 @@ def write_volume(
     packed = io.BytesIO()  # a zip file that fails half-way complains when it is forgotten
     np.savez_compressed(packed, **arrays)
     write_whole(out, lambda file: file.write(packed.getbuffer()))
-    share = float(kept.double().mean())
-    return {"shape": list(counts), "cells": math.prod(counts), "kept_share_of_cells": share}
+    return {
+        "shape": list(counts),
+        "cells": math.prod(counts),
+        "kept_share_of_cells": float(kept.double().mean()),
+        "frame": "run",
+    }
