@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from small_learner import SMALLEST, NoPixels, small_mixture
 
 from leco_plugin.learning.calibration import CalibrationConfig
@@ -19,7 +20,7 @@ from leco_plugin.learning.sharpening import SharpeningConfig
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.scenes import learning_data
 from leco_plugin.scenes.learning_data import count_held_out, held_out_bundle, held_out_rays
-from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler, HeldOutPixelSamplerConfig
+from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler
 
 COUNT = 50
 
@@ -31,7 +32,9 @@ class Pixels:
         image = torch.rand(2, 20, 30, 3)
         self.images = {"image": image, "image_idx": torch.arange(2)}
         self.train_pixel_sampler = (
-            HeldOutPixelSamplerConfig().setup(num_rays_per_batch=8) if keeps_pixels_back else None
+            PixelSamplerConfig(HeldOutPixelSampler).setup(num_rays_per_batch=8)
+            if keeps_pixels_back
+            else None
         )
         self.iter_train_image_dataloader = iter([self.images])
         cameras = SimpleNamespace(to=lambda device: cameras, generate_rays=self.generate_rays)

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 
 from leco_plugin.learning.calibration import CalibrationConfig, Measured
 from leco_plugin.learning.quality import views_in_words
@@ -17,14 +18,14 @@ from leco_plugin.occupancy import CAMERAS_THAT_VOUCH
 from leco_plugin.scenes import learning_data
 from leco_plugin.scenes.bounds import BoundsConfig
 from leco_plugin.scenes.learning_data import LearningData
-from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler, HeldOutPixelSamplerConfig
+from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler
 
 
 @pytest.fixture
 def data(monkeypatch: pytest.MonkeyPatch) -> LearningData:
     """Forty photographs in memory."""
     monkeypatch.setattr(learning_data, "survey", lambda *_: None)
-    sampler = HeldOutPixelSampler(HeldOutPixelSamplerConfig(num_rays_per_batch=50))
+    sampler = HeldOutPixelSampler(PixelSamplerConfig(num_rays_per_batch=50))
     images = {"image": torch.zeros(40, 6, 7, 3), "image_idx": torch.arange(40)}
     manager: Any = SimpleNamespace(
         train_dataset=range(40),

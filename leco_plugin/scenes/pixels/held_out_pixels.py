@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
 import torch
-from nerfstudio.data.pixel_samplers import PixelSampler, PixelSamplerConfig
+from nerfstudio.data.pixel_samplers import PixelSampler
 from torch import Tensor
 
 from leco_plugin.scenes.input_error import InputError
@@ -149,14 +149,6 @@ def _stepping_aside(sample: Callable[..., Tensor]) -> Callable[..., Tensor]:
         )
 
     return sample_others
-
-
-@dataclass
-class HeldOutPixelSamplerConfig(PixelSamplerConfig):
-    """Samples pixels uniformly, except for a lattice that calibration keeps to itself."""
-
-    _target: type = field(default_factory=lambda: HeldOutPixelSampler)
-    """target class to instantiate"""
 
 
 class HeldOutPixelSampler(PixelSampler):

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from torch import Tensor
 
 from leco_plugin.scenes.bounds import FEWEST_POINTS
 from leco_plugin.scenes.pixels.held_out_pixels import (
     HeldOutPixelSampler,
-    HeldOutPixelSamplerConfig,
     Lattice,
     look_up,
     sizes_of,
@@ -128,8 +128,9 @@ DISTANCE = "known_distance"
 
 
 @dataclass
-class KnownDistancePixelSamplerConfig(HeldOutPixelSamplerConfig):
-    """Samples pixels uniformly, and a share of them where sparse points are seen."""
+class KnownDistancePixelSamplerConfig(PixelSamplerConfig):
+    """Samples pixels uniformly, except for a lattice that calibration keeps to itself, and a share
+    of them where sparse points are seen."""
 
     _target: type = field(default_factory=lambda: KnownDistancePixelSampler)
     """target class to instantiate"""

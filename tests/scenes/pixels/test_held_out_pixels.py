@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch
+from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from scene_files import refused
 
 from leco_plugin.scenes.pixels import held_out_pixels
 from leco_plugin.scenes.pixels.held_out_pixels import (
     PERIODS,
     HeldOutPixelSampler,
-    HeldOutPixelSamplerConfig,
     Lattice,
     Share,
     look_up,
@@ -29,7 +29,7 @@ def images(masked: bool = False) -> dict[str, torch.Tensor]:
 
 
 def sampler(**options) -> HeldOutPixelSampler:
-    config = HeldOutPixelSamplerConfig(num_rays_per_batch=5000, **options)
+    config = PixelSamplerConfig(HeldOutPixelSampler, num_rays_per_batch=5000, **options)
     made = config.setup()
     assert isinstance(made, HeldOutPixelSampler)
     return made

@@ -11,12 +11,12 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from PIL import Image
 from scene_files import refused
 
 from leco_plugin.scenes.pixels.held_out_pixels import (
     HeldOutPixelSampler,
-    HeldOutPixelSamplerConfig,
     Lattice,
     some_images,
 )
@@ -48,7 +48,7 @@ def write(folder: Path, masked: bool = False, channels: int = 3) -> InputDataset
 
 
 def sampler(rays: int = 4000, **options: object) -> HeldOutPixelSampler:
-    made = HeldOutPixelSamplerConfig().setup(num_rays_per_batch=rays, **options)
+    made = PixelSamplerConfig(HeldOutPixelSampler).setup(num_rays_per_batch=rays, **options)
     assert isinstance(made, HeldOutPixelSampler)
     return made
 
