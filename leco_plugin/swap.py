@@ -41,15 +41,11 @@ def swapped_config(
 ) -> TrainerConfig:
     """The config of a registered method with its sampler swapped.
 
-    Args:
-        method: name, as `ns-train` knows it.
-        file: an occupancy, or the folder of a run that left one; None learns one first, for a
-            sampler that asks one.
-        arguments: what `ns-train METHOD` would be given.
-        sampler: name in the registry of samplers.
-        options: of that sampler, by name.
-        codes: of the host's photographs, as `GuidedModelConfig.codes`.
-        other_scene: as `OccupancyConfig.other_scene`.
+    `ns-train` would be given `method` and `arguments`. `file` is an occupancy, or the folder of a
+    run that left one; None learns one first, for a sampler that asks one. `sampler` is a name in
+    the registry of samplers, `options` are its own. `codes` is as of `GuidedModelConfig`,
+    `other_scene` as of `OccupancyConfig`.
+
     Raises:
         InputError: there is no such method, or it is guided or learns occupancy itself; there is no
             such sampler, or it asks another kind of gate, or has no such option; there is no such
