@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -71,11 +72,14 @@ def run_cell(
     data: Path,
     protocol: Protocol,
     folder: Path,
+    on_progress: Callable[[float], None],
 ) -> dict[str, Any]:
     """Trains and measures; arguments and record as of `chart.worker.run_job`, with `measured`."""
     began = time.process_time()
     config = with_fixed_batches(config_of(contender, data, folder / "nerfstudio"))
-    record, trainer = train_job(config, contender, seed, data, protocol, folder, looked_at=False)
+    record, trainer = train_job(
+        config, contender, seed, data, protocol, folder, on_progress, looked_at=False
+    )
     options = contender.changes.get("occupancy.options", {})
     measured, shown = measure(trainer.pipeline, data, options.get("samples", 192))
     Image.fromarray(shown).save(folder / "view.png")

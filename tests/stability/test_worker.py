@@ -45,7 +45,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run(contender: Contender, scene: Path, folder: Path) -> dict[str, Any]:
     folder.mkdir()
-    record = run_cell(contender, 0, scene, Protocol(steps=MICRO.steps), folder)
+    shown: list[float] = []
+    record = run_cell(contender, 0, scene, Protocol(steps=MICRO.steps), folder, shown.append)
+    assert shown[-1] == 1.0
     assert (folder / "view.png").exists()
     assert record["steps"] == MICRO.steps and 0.0 < record["psnr"] < 60.0
     assert record["curve"] == [] and record["ssim"] is None  # nobody else has looked
