@@ -30,11 +30,9 @@ VOLUMES = (0.01, 0.015, 0.02, 0.03, 0.04, 0.06, 0.08, 0.11, 0.15, 0.2, 0.3, 0.45
 TOLERANCE = 1.05
 """Kept volume that counts as no more than another's."""
 TOLD_APART = 1.2
-"""A representation certainly keeps more than another from this ratio of kept volumes on: all is
-measured with one field and one seed."""
+"""From this ratio of kept volumes on, one field and one seed tell two apart."""
 WORTH_TEN_TIMES = 2 / 3
-"""Ten times the bytes must leave at most this share of the kept volume. The largest nearly always
-keep a little less, and a scene would otherwise need the last one that is tried."""
+"""Ten times the bytes must leave at most this share of the kept volume."""
 USUAL_GRID = 128
 """Cells along an axis of the grids that hosts have by default, which any of them can afford."""
 LEAST = 1e-5
@@ -46,7 +44,6 @@ NAMES = {
     "k-planes": "gate on K-planes",
     "grid": "occupancy grid",
 }
-"""Of the families of representations."""
 
 
 def stored_bytes(row: Row) -> int:
@@ -55,8 +52,8 @@ def stored_bytes(row: Row) -> int:
 
 
 def choose(rows: Sequence[Row]) -> Row:
-    """The representation beside which no other keeps so much less that its bytes pay. One that
-    keeps all is none."""
+    """The one beside which no other keeps so much less that its bytes pay; what keeps all is
+    none."""
     power = -math.log10(WORTH_TEN_TIMES)
 
     def worth(row: Row) -> tuple[bool, float, int]:
@@ -89,17 +86,12 @@ def grid_that_suffices(rows: Sequence[Row], times: float = TOLERANCE) -> Row | N
     return grid if grid is not None and int(grid["size"]) <= USUAL_GRID else None
 
 
-def grid_that_nearly_suffices(rows: Sequence[Row]) -> Row | None:
-    """A grid of a usual size that keeps more, but not so much that one field tells them apart."""
-    return grid_that_suffices(rows, TOLD_APART) if grid_that_suffices(rows) is None else None
-
-
 def title_of(rows: Sequence[Row]) -> str:
     """What the scene needs, in ten words at most."""
     chosen = choose(rows)
     if chosen["family"] == "grid":
         return f"A grid suffices: {_of_cells(chosen).replace('^3', '³')}"
-    also = "; perhaps a grid" if grid_that_nearly_suffices(rows) else ""
+    also = "; perhaps a grid" if grid_that_suffices(rows, TOLD_APART) else ""
     if grid := grid_that_suffices(rows):
         also = f", or {grid['size']}³ cells"
     return f"A gate of {kilobytes(chosen)} suffices{also}"
@@ -121,7 +113,7 @@ def verdict(rows: Sequence[Row]) -> str:
         return said
     if grid := grid_that_suffices(rows):
         return f"A grid suffices: {_of_cells(grid)}. With {kilobytes(chosen)} {named}, as little."
-    if nearly := grid_that_nearly_suffices(rows):
+    if nearly := grid_that_suffices(rows, TOLD_APART):
         return (
             f"{said} A grid of {_of_cells(nearly)}, keeps {nearly['kept_volume']:.1%}: with one "
             "field the two are not told apart, and a grid may suffice."
@@ -210,7 +202,6 @@ def _draw_panel(panel: Any, rows: Sequence[Row], values: list[float], theme: The
 
 
 def circumstances(results: Mapping[str, Any]) -> str:
-    """What was measured, in a line or two."""
     machine, scene = results["machine"], results["scene"]
     full = [row["size"] for row in results["representations"] if _keeps_all(row)]
     left_out = f" (not drawn, as they keep all: {', '.join(full)})" if full else ""
@@ -224,7 +215,6 @@ def circumstances(results: Mapping[str, Any]) -> str:
 
 
 LEAST_OF_A_GATE = 1e-6
-"""Lost surface mass that is drawn for none at all."""
 
 
 def line_of_original(itself: Rung, measured: bool) -> str:

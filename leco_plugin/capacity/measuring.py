@@ -56,8 +56,7 @@ FIELD = "field.pt"
 RAYS, TAUGHT_RAYS = 8192, 1 << 15
 VOLUME_POINTS = 1 << 17
 STEPS = 3000
-"""With which each gate is taught. After 300 small ones still keep two to nine times what they keep
-after 1000 (docs/decisions.md)."""
+"""Of teaching: after 300, small gates keep two to nine times what they keep after 1000."""
 
 
 class Taught(NamedTuple):
@@ -70,8 +69,7 @@ class Taught(NamedTuple):
     mapped: Tensor
     """[M, 3] of those candidates, in [-1, 1]."""
     volume: Tensor
-    """[P, 3] mapped, spread evenly over the part of the scene's box that rays reach. Elsewhere
-    nothing is taught."""
+    """[P, 3] mapped, spread evenly over what rays reach of the scene's box."""
 
 
 def prepare(data: Path, folder: Path, learn_steps: int) -> Taught:
@@ -154,11 +152,8 @@ def measure(evidence: Evidence, scores: Tensor, of_volume: Tensor, lost: float) 
 
 
 def lost_where(worth: Tensor, scores: Tensor, of_volume: Tensor, share: float) -> float:
-    """Share of the worth [M] of candidates that is lost where just so much of the volume is kept.
-
-    Of what has the score of the threshold, as many cells of a grid may have, a part is kept, drawn
-    by lot: all of it would be more than is asked for.
-    """
+    """Share of the worth [M] that is lost where just so much of the volume is kept. Of places with
+    the threshold's score, as many cells may have, a part is kept by lot."""
     threshold = find_threshold(of_volume, share)
     above, at = (
         float(part.double().mean()) for part in (of_volume > threshold, of_volume == threshold)
@@ -180,8 +175,7 @@ def measure_gate(taught: Taught, candidate: Candidate, lost: float) -> dict[str,
 def taught_score(
     config: GateConfig, lesson: Lesson, precision: Precision
 ) -> Callable[[Tensor], Tensor]:
-    """The logit of a gate that is taught now, as it would be stored and asked: of mapped positions
-    [N, 3], [N]."""
+    """The logit [N] of a gate that is taught now, as stored: of mapped positions [N, 3]."""
     gate = teach(config, lesson, STEPS, precision)
 
     @torch.no_grad()
@@ -209,8 +203,7 @@ def measure_grid(taught: Taught, candidate: Candidate, lost: float) -> dict[str,
 
 
 def taught_grid(lesson: Lesson, box: ViewBox, cells: int) -> Tensor:
-    """Scores [n, n, n] of a grid that the lesson of the gates teaches: a cell has the largest
-    target in it."""
+    """Scores [n, n, n] of a grid: a cell has the largest target of the lesson in it."""
     scores = torch.zeros((cells,) * 3, device=lesson.mapped.device)
     return largest_in_cells(scores, box, lesson.mapped, 1.0 - lesson.skip)
 
@@ -254,7 +247,7 @@ def capacity(
         "teach_steps": STEPS,
         "grids": "by the lesson of the gates",
     }
-    _take_folder(out, {"scene": scene, **settings}, data)
+    take_folder(out / SETTINGS, {"scene": scene, **settings}, "points with another", DAMAGED)
     candidates = [*gates(), *_grids_that_fit(resolutions)]
     taught = prepare(data, out, learn_steps)
     rows = _measure_missing(out, taught, candidates, lost_surface_mass, code)
@@ -306,16 +299,6 @@ def _measure_missing(
     return [rows[one.key] for one in candidates]
 
 
-def _take_folder(out: Path, settings: dict[str, Any], data: Path) -> None:
-    """As `take_folder`; of another scene only its folder is said."""
-    file = out / SETTINGS
-    if file.is_file() and read_object(file, DAMAGED).get("scene") != settings["scene"]:
-        raise InputError(
-            f"{out} holds points of another scene than {data}; name a new folder with --out"
-        )
-    take_folder(file, settings, "points with another", DAMAGED)
-
-
 def _grids_that_fit(resolutions: Sequence[int]) -> list[Candidate]:
     """The grids that fit the memory; says which do not."""
     found = []
@@ -328,7 +311,6 @@ def _grids_that_fit(resolutions: Sequence[int]) -> list[Candidate]:
 
 
 def _stored(out: Path, candidate: Candidate) -> dict[str, Any] | None:
-    """The row of an earlier call; None where there is none."""
     file = out / POINTS / f"{candidate.key}.json"
     if not file.exists():
         return None

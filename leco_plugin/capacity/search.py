@@ -1,8 +1,7 @@
 """Gates and grids of growing size, and the search for the smallest gate that holds.
 
-From small to large: teach, find a threshold, measure. The threshold gives each gate the kept volume
-of the original, so that they differ in the loss. It is found on rays of its own; what is declared
-is measured on others.
+The threshold gives each gate the kept volume of the original, so that they differ in the loss. It
+is found on rays of its own; what is declared is measured on others.
 """
 
 from __future__ import annotations
@@ -72,7 +71,6 @@ class Candidate:
 
 
 def gates() -> list[Candidate]:
-    """Gates of growing size of each kind, for `leco capacity`."""
     found = []
     for octaves, width, layers in FREQUENCY_SIZES:
         gate = GateConfig(EncodingConfig(octaves=octaves), width, layers, 1)
@@ -90,15 +88,12 @@ def gates() -> list[Candidate]:
 
 
 def grids(resolutions: tuple[int, ...]) -> list[Candidate]:
-    """Grids by their cells along an axis."""
     return [Candidate("grid", str(n), resolution=n) for n in sorted(resolutions)]
 
 
 def ladder(most_values: int) -> list[GateConfig]:
-    """The gates that `leco shrink` tries, by size: all that have fewer values than given.
-
-    They have one scene expert, for o(x) is all that is asked of an occupancy.
-    """
+    """The gates that `leco shrink` tries, by size: all with fewer values. One scene expert is
+    enough."""
     found = [
         GateConfig(EncodingConfig(octaves=octaves), width, layers, 1, octaves < ENOUGH_OCTAVES)
         for octaves, width, layers in FREQUENCY
@@ -115,7 +110,6 @@ def ladder(most_values: int) -> list[GateConfig]:
 
 
 def _on_planes(cells: int, features: int, levels: int) -> GateConfig:
-    """A gate on K-planes: one level of `cells` along an axis, or several from 16 up to that."""
     coarsest = 16 if levels > 1 else cells
     encoding = EncodingConfig(
         "k-planes", levels=levels, features=features, coarsest=coarsest, plane_cells=cells
@@ -130,7 +124,6 @@ def values_of(config: GateConfig) -> int:
 
 
 def name_of(config: GateConfig) -> str:
-    """A gate in a word or two, as in tables."""
     encoding = config.encoding
     sizes = {
         "frequency": f"{encoding.octaves} octaves",
@@ -142,11 +135,10 @@ def name_of(config: GateConfig) -> str:
 
 
 STEPS, LONGER, NEARLY = 3000, 3, 3.0
-"""Steps of teaching. A gate whose loss is at most `NEARLY` times what the search allows is taught
-again, `LONGER` times as long."""
+"""Steps of teaching; `LONGER` times as many where a loss is at most `NEARLY` times what is allowed.
+"""
 EMPHASIS, WEIGHT_AT_FULL = 8.0, 0.05
-"""How much more a candidate with rendering weight counts, and the weight from which on it does so
-fully."""
+"""How much more a candidate with at least this rendering weight counts."""
 MARGIN = 0.5
 """Share of the allowed loss that a gate may use on the rays of the search, so that others hold."""
 VOLUME_POINTS = 1 << 17
@@ -235,11 +227,8 @@ def lesson_of(original: Occupancy, taught: Evidence) -> Lesson:
 def _measure(
     ground: Ground, smaller: Occupancy, bounds: Bounds, volume: Tensor, kept: float, look: int
 ) -> tuple[Rung, Occupancy]:
-    """What is found of a gate, and the gate with the threshold that it was found with.
-
-    The original keeps a share of places [P, 3] in its box. A look at the verifying rays would have
-    the number `look`.
-    """
+    """What is found of a gate, and the gate with its threshold. A look would have the number
+    `look`."""
     losses_at = _losses_of(smaller, ground.references)
     of_volume = in_parts(smaller.query, volume)
     lost, holds, ratio = 0.0, False, 0.0
@@ -293,11 +282,8 @@ def _losses_of(
 def lower_threshold(ground: Ground, bounds: Bounds) -> Occupancy | None:
     """The original at the largest lower threshold that meets what is asked of a smaller gate.
 
-    Calibration allows a loss in the mean of some thousand held-out rays, but what is declared has
-    to hold on others, too. A smaller gate loses more than the original whose decisions it is
-    taught. So an original that itself loses too much is asked to keep more.
-
-    It shares the original's gate; None where the original meets that as it is, no threshold does,
+    Calibration allows a loss in the mean of held-out rays; what is declared holds on others, too,
+    and a smaller gate loses more. None where the original meets that as it is, no threshold does,
     or nothing measures.
     """
     original = ground.original

@@ -1,8 +1,4 @@
-"""Photographs and their rays, and the model that was trained on them.
-
-An occupancy lies in the folder of the run that learned it. The rendering weights of that run's
-model say what a dropped candidate was worth.
-"""
+"""Photographs and their rays, and the model of the run that learned an occupancy."""
 
 from __future__ import annotations
 
@@ -154,8 +150,8 @@ def draw_training_rays(source: Source, occupancy: Occupancy, count: int) -> Seen
 def draw_other_pixels(
     source: Source, occupancy: Occupancy, count: int, besides: Iterable[Seen]
 ) -> Seen:
-    """Rays of different training pixels, besides those of other rays; fewer than `count` where the
-    photographs have hardly more pixels."""
+    """Rays of different training pixels, besides others; fewer where there are hardly more
+    pixels."""
     known = [_numbers(seen.pixels) for seen in besides if seen.pixels is not None]
     taken = np.concatenate([np.empty(0, np.int64), *known])
     pieces: list[tuple[Tensor, Tensor]] = []
@@ -175,8 +171,7 @@ def draw_other_pixels(
 
 
 def move_between_cameras(source: Source, seen: Seen, seed: int) -> Seen:
-    """The same rays of training images, each moved by a random part of the way from its camera to
-    the nearest one. The colours are not those of the moved rays."""
+    """Rays of training images, each moved by a random part of the way to the nearest camera."""
     rays = seen.rays
     assert source.model is not None and rays.images is not None
     images = rays.images.cpu()
@@ -244,7 +239,7 @@ def _see_pixels(source: Source, occupancy: Occupancy, pixels: Tensor, truth: Ten
 
 
 def _numbers(pixels: Tensor) -> np.ndarray:
-    """A different number for each different pixel [R, 3]: [R] int64."""
+    """A number for each different pixel [R, 3]: [R] int64."""
     image, row, column = pixels.cpu().numpy().T
     return (image << 40) + (row << 20) + column
 

@@ -23,18 +23,19 @@ from leco_plugin.chart.contender import (
     settings_of,
 )
 from leco_plugin.chart.runner import (
+    DAMAGED,
     RESULTS,
     RUNS,
+    SETTINGS,
     RunFailed,
     RunFolder,
     Runner,
     difference,
     make_jobs,
-    read_settings,
     stored_in,
 )
 from leco_plugin.chart.table import table
-from leco_plugin.evaluation.report import describe_code, describe_machine
+from leco_plugin.evaluation.report import describe_code, describe_machine, read_object
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import describe_held_out, describe_scene, megapixels_of
 from leco_plugin.scenes.whole_files import write_json
@@ -44,8 +45,7 @@ NOTHING_SKIPPED = "; no occupancy was learned in this time, so that nothing was 
 
 
 def jobs_of(contenders: Sequence[Contender], seeds: Sequence[int]) -> list[Job]:
-    """All runs. Contenders take turns within a seed, and each seed begins with another one, so
-    that a machine whose speed drifts treats them alike."""
+    """All runs. Contenders take turns, so that a machine whose speed drifts treats them alike."""
     jobs = []
     for turn, seed in enumerate(dict.fromkeys(seeds)):
         first = turn % len(contenders)
@@ -100,8 +100,7 @@ class Chart:
         """Makes what is missing; whenever it is stopped, what was finished is kept.
 
         Args:
-            runner: called in several threads where there are several runs at once. It ends what is
-                under way when `stop` is set.
+            runner: called in several threads for several runs at once; `stop` ends them.
             say, show: as of `make_jobs`.
         Raises:
             InputError: another process makes runs in the same folder.
@@ -114,9 +113,8 @@ class Chart:
         with self.folder.alone():
             taken = take_over(self.folder, self.missing(), self.reuse)
             if taken:
-                say(f"{_counted(len(taken), 'run')} taken over from other charts")
-            todo = self.missing()
-            if todo:
+                say(f"{_counted(len(taken))} taken over from other charts")
+            if todo := self.missing():
                 say(self.forecast(todo))
             self.write()
             make_one, done = partial(self._make_one, runner), len(self.jobs) - len(todo)
@@ -146,15 +144,15 @@ class Chart:
         """How many runs are to be made, and about how long that takes."""
         megapixels = megapixels_of(self.data) or SMALL
         about = forecast((job.contender for job in todo), self.protocol, megapixels)
-        runs = f"{_counted(len(todo), 'run')} of {self.protocol.describe()}"
+        runs = f"{_counted(len(todo))} of {self.protocol.describe()}"
         beside = f", {self.protocol.at_once} at a time" if self.protocol.at_once > 1 else ""
         stored = len(self.jobs) - len(todo)
         there = f" ({stored} more are there already)" if stored else ""
         return f"{runs}{beside}, {about}{there}"
 
     def failures(self) -> list[dict[str, Any]]:
-        """Runs that ended without a result, by seed, and whether this call asked for them. Those of
-        earlier settings under the same name are left out, as in `results`."""
+        """Runs without a result, by seed, and whether this call asked for them; filtered as
+        `results`."""
         names = {one.key: one.name for one in self.contenders}
         asked, found = {(job.contender.key, job.seed) for job in self.jobs}, []
         for one in self.folder.failures():
@@ -206,8 +204,7 @@ class Chart:
         return {"date": today, "command": self.command, **describe_code()}
 
     def _made_of(self, stored: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-        """The same of all stored runs: the commands that made runs which this call does not ask
-        for, then this call's, and the commits of all."""
+        """The same of all stored runs: the commands that made them, and their commits."""
         asked = {job.name for job in self.jobs}
         others = [one["made"]["command"] for name, one in stored.items() if name not in asked]
         commits = {one["made"]["commit"] for one in stored.values()} - {None}
@@ -223,8 +220,7 @@ class Chart:
         return results
 
     def draw(self) -> dict[str, Any]:
-        """Writes the results, and where a run has succeeded `chart.png`, light and dark, and
-        `chart.html`."""
+        """Writes the results, and where a run has succeeded the pictures and `chart.html`."""
         from leco_plugin.chart import page, picture
         from leco_plugin.chart.theme import DARK, LIGHT
 
@@ -237,26 +233,24 @@ class Chart:
         return results
 
 
-def _counted(count: int, name: str) -> str:
-    return f"{count} {name}{'s' if count != 1 else ''}"
+def _counted(runs: int) -> str:
+    return f"{runs} run{'s' if runs != 1 else ''}"
 
 
 def why_not_shared(source: Path, settings: Mapping[str, Any]) -> str | None:
-    """Why a chart with these settings cannot use the runs of another folder; None if it can.
-
-    Only what they were made for, a suite or none, may differ. A damaged folder is an `InputError`.
-    """
-    found = read_settings(source)
-    if found is None:
+    """Why a chart with these settings cannot use the runs of another folder, or None. The suite may
+    differ. A damaged folder is an `InputError`."""
+    file = source / SETTINGS
+    if not file.is_file():
         return "there is no chart in it"
     shared = {name: value for name, value in settings.items() if name != "suite"}
-    other = difference(found, shared)
+    other = difference(read_object(file, DAMAGED), shared)
     return other and f"its runs have another {other}"
 
 
 def take_over(folder: RunFolder, missing: Sequence[Job], sources: Sequence[Path]) -> list[Job]:
-    """Copies missing runs from the folders of other charts that have passed `unlike`, each from the
-    first that has it; returns their jobs."""
+    """Copies missing runs, each from the first folder of a chart that has it; returns their
+    jobs."""
     left, taken = list(missing), []
     for source in sources:
         for name, record in stored_in(source).items():
@@ -272,10 +266,7 @@ def take_over(folder: RunFolder, missing: Sequence[Job], sources: Sequence[Path]
 
 
 def is_run_of(record: Mapping[str, Any], job: Job) -> bool:
-    """Whether a stored run is the run of a job.
-
-    Grids and taught gates are made from its field afterwards: a run with more of them serves too.
-    """
+    """Whether a stored run is that of a job; one with more grids and taught gates serves too."""
     made = Contender.from_dict(record["contender"])
     alike = made.alone().key == job.contender.alone().key
     has_all = set(job.contender.grids) <= set(made.grids) and job.contender.taught <= made.taught

@@ -23,28 +23,19 @@ LEFT_BY_SYSTEMS = (".DS_Store", "Thumbs.db")
 
 @dataclass(frozen=True)
 class Asked:
-    """The options beside what is compared; None where a suite has its own."""
+    """The options of `leco chart` beside what is compared; None where a suite has its own."""
 
     seconds: float | None = None
-    """Training time of each run."""
     steps: int | None = None
-    """Training steps of each run."""
     learn_seconds: float | None = None
-    """Limit for learning an occupancy."""
     seeds: Sequence[int] = (0, 1, 2)
-    """Of each contender."""
     images: int = 2
-    """Whole test images rendered by each run."""
     at_once: int | None = None
-    """Runs at a time; None is one, or as a suite has it."""
     reuse: Sequence[Path] = ()
-    """Folders of other charts on this scene, whose runs need not be made again."""
     held_out: HeldOut = "spread"
-    """Which photographs are tested."""
 
 
 def processes(chart: Chart) -> Runner:
-    """Makes the runs of a chart in processes of their own."""
     threads = chart.machine["threads"] if chart.protocol.at_once > 1 else None
     return ProcessRunner(chart.data, chart.protocol, chart.folder, WORKER, threads, chart.stop)
 
@@ -99,7 +90,6 @@ def refuse_failures(made: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _check_shared(out: Path) -> None:
-    """Refuses a folder that holds something else than suites."""
     known = [*SUITES, *LEFT_BY_SYSTEMS]
     held = sorted(path.name for path in out.iterdir()) if out.exists() else []
     others = [name for name in held if name not in known]
@@ -118,7 +108,6 @@ def _chart_of(
     methods: Sequence[str] = (),
     samplers: Sequence[str] = (),
 ) -> Chart:
-    """The chart of a suite of a name, or of methods and samplers."""
     suite = SUITES[name] if name is not None else None
     compared = suite.contenders if suite else contenders(methods, samplers)
     usual = suite.protocol.at_once if suite else 1
@@ -142,7 +131,6 @@ def _chart_of(
 
 
 def _make(chart: Chart, runner_for: Callable[[Chart], Runner]) -> dict[str, Any]:
-    """Makes what is missing of a chart, and draws all of it; returns its results."""
     suite = f"{chart.suite}, " if chart.suite else ""
     title = f"{chart.scene['name']}, {suite}{chart.protocol.describe()} a run"
     with resumable(), bar(title) as show:

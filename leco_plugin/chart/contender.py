@@ -38,11 +38,11 @@ class Contender:
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Settings under `--pipeline.model.`, by their path."""
     grids: tuple[int, ...] = ()
-    """Cells along an axis of grids that are made from its field and compared with its gate."""
+    """Cells along an axis of grids made from its field and compared with its gate."""
     taught: bool = False
     """Whether its field teaches small gates that are compared with its gate."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of the whole method, by their path; keys of dictionaries are steps of it too."""
+    """Settings of the whole method, by their path."""
 
     @property
     def key(self) -> str:
@@ -84,11 +84,8 @@ class Job:
 
 
 def changed(config: Any, path: str, value: Any) -> Any:
-    """A copy of a config, of dataclasses and dictionaries, with one setting changed.
-
-    Raises:
-        ValueError: there are no such fields and keys, with dots between them in the path.
-    """
+    """A copy of a config, of dataclasses and dictionaries, with the setting of a dotted path
+    changed; `ValueError` where there is none."""
     name, _, rest = path.partition(".")
     if isinstance(config, dict):
         if name not in config:
@@ -108,9 +105,8 @@ def config_of(
 ) -> TrainerConfig:
     """The config of a contender's training run.
 
-    All contenders read the scene with our parser, so that they render the same test pixels, and
-    draw their rays on the clock. A host that learns its occupancy first may do so for
-    `learn_seconds`.
+    All read the scene with our parser, so that they render the same test pixels, and draw their
+    rays on the clock. A host that learns its occupancy first may do so for `learn_seconds`.
 
     Raises:
         InputError: there is no such method, its reader cannot hold out a stretch, or a process of
@@ -153,12 +149,8 @@ def config_of(
 
 
 def in_this_process(datamanager: Any) -> Any:
-    """The same data and rays from a data manager without processes of its own: what these do, the
-    clock of a run does not count.
-
-    Raises:
-        InputError: it is a third party's, which nothing can replace.
-    """
+    """The same data and rays from a data manager without processes of its own, whose time the clock
+    does not count; `InputError` for one of a third party."""
     from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
     from nerfstudio.data.datamanagers.parallel_datamanager import ParallelDataManagerConfig
 
@@ -229,7 +221,7 @@ class Protocol:
                 raise ValueError(f"at least one of the {name} is needed, not {count}")
 
     def budget(self) -> Budget:
-        """When a run is over; a time or a number of steps that is no such raises `ValueError`."""
+        """When a run is over; `ValueError` for a time or a number of steps that is none."""
         learning = self.learn_seconds
         if learning is None and self.seconds is not None:
             learning = LEARN_SHARE * self.seconds
@@ -280,10 +272,9 @@ class Cores:
     unguided: float
     """More of that in a run that skips nothing."""
     grids: float
-    """Making grids up to 512^3 from the field of a run, and teaching small gates by it."""
+    """Making grids up to 512^3 from a field, and teaching small gates by it."""
     megapixel: float
-    """Rendering a million pixels by a run that skips; one that does not takes `UNGUIDED` times as
-    long."""
+    """Rendering a million pixels by a run that skips; others take `UNGUIDED` times as long."""
 
 
 SMALL, UNGUIDED = 480 * 360 / 1e6, 5.0
@@ -297,8 +288,7 @@ SLOW = Cores(step=0.45, overhead=45.0, unguided=60.0, grids=280.0, megapixel=40.
 def run_seconds(
     contender: Contender, protocol: Protocol, cores: Cores, megapixels: float = SMALL
 ) -> float:
-    """Forecast of one run, from the start of its process to the end; its test images have so many
-    million pixels."""
+    """Forecast of one run with test images of so many million pixels."""
     steps = None if protocol.steps is None else protocol.steps * cores.step
     seconds = min(end for end in (protocol.seconds, steps) if end is not None) + cores.overhead
     larger = max(0.0, megapixels - SMALL) * protocol.images * cores.megapixel
@@ -317,7 +307,6 @@ def forecast_minutes(
 
 
 def forecast(contenders: Iterable[Contender], protocol: Protocol, megapixels: float = SMALL) -> str:
-    """The same in words, for fast cores and for slow ones."""
     given = list(contenders)
     fast, slow = (
         max(1, round(forecast_minutes(given, protocol, cores, megapixels)))

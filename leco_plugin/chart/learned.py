@@ -14,7 +14,7 @@ from leco_plugin.chart.summary import Line, compare, figure_in, middle_of
 OURS = "(ours)"
 """Marks the contender that a suite asks about."""
 KEPT_WHEN_FROZEN = "at_equal_loss.kept_reached_volume"
-"""Share of the volume reached by rays that a gate keeps at equal loss."""
+"""Share of the volume reached by rays."""
 AT_THE_END = 0.99
 """Share of the training time; a gate that is frozen later has guided nothing."""
 
@@ -24,9 +24,9 @@ class Learned(Line):
 
     @cached_property
     def facts(self) -> list[dict[str, Any]]:
-        """Of each seed with a frozen gate: its run's `occupancy`, the figures that
-        `TimedRun.at_freezing` has as they were at freezing, and all as they are `at_end`; its
-        `seed`, and whether it was frozen `at_the_end` of its training."""
+        """Of each seed with a frozen gate: its run's `occupancy`, with figures as of the moment of
+        freezing, and all as they are `at_end`; its `seed`; and whether it was frozen `at_the_end`.
+        """
         return [
             {
                 **run["occupancy"],
@@ -41,7 +41,7 @@ class Learned(Line):
 
     @property
     def seeds(self) -> int:
-        """How many there are, with a frozen gate or without."""
+        """With a frozen gate or without."""
         return len(self.runs)
 
     @property
@@ -85,16 +85,14 @@ class Learned(Line):
 
 
 def learned_of(lines: Sequence[Line]) -> list[Learned]:
-    """Of each contender that learns an occupancy with a gate, whether it was ever frozen or not;
-    none where nothing was."""
+    """Of each contender that learns an occupancy; none where no gate was ever frozen."""
     found = [Learned(**vars(line)) for line in lines if line.learned]
     return found if any(one.facts for one in found) else []
 
 
 def learned_headline(learned: Sequence[Learned], short: bool = False) -> str:
-    """Space kept at equal loss and PSNR of ours, or of the first that always froze, and which
-    other is better in both: medians of space and means of PSNR. What is short leaves out the rest
-    of the others."""
+    """Space kept and PSNR of ours, or of the first that always froze, and who is better in both:
+    medians of space, means of PSNR. What is short leaves out the rest of the others."""
     known = [one for one in learned if one.is_measured]
     if not known:
         return "no gate was frozen with every seed"
@@ -152,14 +150,13 @@ def percent(value: float) -> str:
 ENOUGH = 0.3
 """dB in the last third of a run's time: who gains more is still rising."""
 HARDLY_TRAINED = 0.4
-"""Share of its time from which on a run that kept its grid up has hardly trained."""
+"""Share of its time from which on updates of a grid have left no time to train."""
 FALL = 0.3
-"""dB below the best point of a run's own curve from which on its end is said to have fallen."""
+"""dB below its own best point from which on a run has fallen."""
 
 
 def last_gain(line: Line) -> float | None:
-    """Mean over seeds of the PSNR gained in the last third of the training time, dB; None where the
-    curve of one has no point before that."""
+    """Mean PSNR gained in the last third of the time, dB; None where a curve begins after that."""
     gains = []
     for run in line.runs:
         seconds, psnrs = zip(*run["curve"])
@@ -171,11 +168,8 @@ def last_gain(line: Line) -> float | None:
 
 
 def still_rising(lines: Sequence[Line]) -> list[str]:
-    """Names of the lines that have not had enough time.
-
-    These gained more than `ENOUGH` in the last third, or their gain is unknown, or their grid has
-    skipped nothing yet or has taken the time of training.
-    """
+    """Names of lines that gained more than `ENOUGH` in the last third, or nobody knows, or whose
+    grid has skipped nothing yet or has taken the time of training."""
 
     def rises(line: Line) -> bool:
         gain = last_gain(line)
@@ -205,8 +199,8 @@ def settling(lines: Sequence[Line]) -> str:
 
 
 def falls(lines: Sequence[Line]) -> str | None:
-    """Which lines have runs that end more than `FALL` below their own best point, in how many runs,
-    and by how much at most; None without any."""
+    """Which lines have runs that end more than `FALL` below their own best point; None without
+    any."""
     fallen = []
     for line in lines:
         below = [max(psnr for _, psnr in run["curve"]) - run["curve"][-1][1] for run in line.runs]

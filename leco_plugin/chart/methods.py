@@ -1,8 +1,7 @@
 """The contenders that names of methods, samplers and suites stand for.
 
-Any registered method and sampler can be charted. A host takes any sampler of its kind, a method
-that learns its occupancy itself any kind of gate. Suites are the comparisons that the reviewers of
-the paper asked for.
+A host takes any sampler of its kind, a method that learns its occupancy itself any kind of gate.
+Suites are the comparisons that the reviewers of the paper asked for.
 """
 
 from __future__ import annotations
@@ -44,8 +43,7 @@ NO_GIFTS = {
     "occupancy.learning.termination": 0.0,
     "occupancy.learning.calibration.recheck_rays": 0,
 }
-"""Take from a learned occupancy what no grid is given: the opaque and the careful start, and the
-distances of sparse points."""
+"""No opaque and careful start, and no distances of sparse points: a grid is given none."""
 SKIPPING_NOTHING = {"schedule.freeze": False, "front_to_back": True}
 """Never frozen; rendered front to back, as guided images are."""
 NEVER_FROZEN = Contender("LeCO, never frozen", "leco-occupancy", DENSE, SKIPPING_NOTHING)
@@ -187,8 +185,8 @@ def contender_of_host(method: str, sampler: str, host: Any) -> Contender | None:
 
 
 def _long_steps(host: Any) -> dict[str, Any] | None:
-    """Changes that give a host steps `LONGER` times as long, of which it skips none; None of a host
-    with another rule for its steps."""
+    """Changes that give a host longer steps, of which it skips none; None for another rule of
+    steps."""
     if isinstance(host, SwitchNerfModelConfig):
         candidates = max(1, host.sizes.candidates // LONGER)
         return {"occupancy.sampler": DENSE, "host.sizes.candidates": candidates}
@@ -206,7 +204,6 @@ def _long_steps(host: Any) -> dict[str, Any] | None:
 
 
 def _own_sampling_of(host: Any) -> str:
-    """How a host samples by itself, in words."""
     if isinstance(host, SwitchNerfModelConfig) and host.sampling == "coarse-fine":
         return "coarse and fine samples"
     if hasattr(host, "num_proposal_samples_per_ray"):
@@ -238,12 +235,11 @@ SCENE_LAYERS = LEARNING.sizes.field.experts.layers
 SWITCH_CELLS = switch_nerf_host.sizes.grid_resolution
 """Cells of Switch-NeRF's own grid."""
 GRIDS = (128, 256, 512) if ON_GPU else (64, 128, 256)
-"""Cells along an axis, updated while the host trains; 512^3 takes two CPU cores all of a run."""
+"""Cells along an axis; 512^3 takes two CPU cores all of a run."""
 MADE_GRIDS = (64, 128, 256, 512)
-"""Made from one field, each from the one before, which costs less than updates in training."""
+"""Made from one field, each from the one before."""
 STEPS = 2 * LEARNING.schedule.learn_steps
-"""Of suites that ask what was learned: half for learning, and a quarter more for a gate that has
-not settled."""
+"""Of suites that ask what was learned: half or, for a slow gate, three quarters for learning."""
 AT_ONCE = 1 if ON_GPU else min(2, usable_cores())
 """Runs at a time: on a CPU, small tensors gain more by another run than by another thread."""
 ALL = "all"
@@ -279,7 +275,6 @@ def _paper(name: str, **changes: object) -> Contender:
 
 
 def _empty_mlp(layers: int) -> dict[str, object]:
-    """Changes that make the empty-space expert an MLP as wide as a scene expert."""
     experts = "sizes__field__experts__"
     return {f"{experts}empty_expert": "mlp", f"{experts}empty_layers": layers}
 
@@ -358,8 +353,8 @@ SUITES = {
 
 
 def in_order(names: Sequence[str]) -> list[str]:
-    """Names of suites, `all` among them or not, in the order of `SUITES`; an `InputError` for one
-    that there is not."""
+    """Names of suites in the order of `SUITES`, `all` replaced; an `InputError` for an unknown
+    one."""
     for name in names:
         if name not in SUITES and name != ALL:
             listed = ", ".join(SUITES)

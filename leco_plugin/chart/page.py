@@ -17,10 +17,8 @@ FRONT = {"color": "rgba(120,120,120,0.45)", "width": 5}
 
 
 def write_page(results: Mapping[str, Any], path: Path) -> Path:
-    """Writes the page of results that hold at least one run.
-
-    A click on a name hides it everywhere, two clicks show it alone; a pointer shows figures.
-    """
+    """Writes the page of results with at least one run. A click on a name hides it everywhere, two
+    clicks show it alone; a pointer shows figures."""
     from plotly.subplots import make_subplots
 
     shown = shown_of(results)

@@ -27,7 +27,6 @@ from leco_plugin.chart.summary import (
 )
 
 HELD_COSTS = {"size": "size of the occupancy, kB", "learn_seconds": LEARNING.titled}
-"""Names in `Held` of what an occupancy costs, and their titles."""
 
 
 def title_of(results: Mapping[str, Any]) -> str:
@@ -66,7 +65,7 @@ class Point:
     x: float
     y: float
     line: int | None
-    """Number of the contender whose colour and marker it has; None for a grid."""
+    """Number of the contender whose look it has; None for a grid."""
     seeds: tuple[tuple[float, float], ...] = ()
     """Places of its seeds, where they are shown."""
     ours: bool = False
@@ -100,8 +99,7 @@ class Shown:
     costs: list[Panel]
     """PSNR against each cost."""
     space: list[Panel]
-    """Space kept at equal loss, where the chart is about that: against size and learning time, or
-    against PSNR."""
+    """Space kept at equal loss, against size and learning time or against PSNR."""
 
 
 def shown_of(results: Mapping[str, Any]) -> Shown:

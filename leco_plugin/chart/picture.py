@@ -40,12 +40,12 @@ BAR = 0.032
 WIDE_RANGE = 8.0
 """Ratio of costs from which on their axis is logarithmic."""
 HIDDEN, RIM = 4.0, 4.0
-"""Points between two markers up to which one would hide the other, and by which that is larger."""
+"""Points between markers up to which one would hide the other, and by which that is larger."""
 TITLE_WIDTH, TEXT_WIDTH = 66, 104
 CHARACTER = 0.0098
 """Width of a letter, as a share of the figure's."""
 TOP, LINE_HEIGHT, SMALL_LINE_HEIGHT = 0.985, 0.04, 0.0235
-"""Top of the title, and line heights of it and of the text below, shares of the figure's height."""
+"""Shares of the figure's height."""
 COSTS_BELOW = "What it costs. Up and left is better; nothing is better in both than the grey line."
 PSNR_BELOW = "PSNR on unseen photographs, dB, against what it costs. Up and left is better:"
 KEPT_SPACE = f"Space that must be sampled where each loses {LOST_SURFACE_MASS:.1%} of the surface"
@@ -202,8 +202,7 @@ def _draw_front(axes: Any, panel: Panel, theme: Theme) -> None:
 
 
 def draw_curves(axes: Any, lines: Sequence[Line], theme: Theme, small: bool = False) -> None:
-    """Mean PSNR of each line against seconds of training, its seeds as a band, and the best so
-    far of all."""
+    """Mean PSNR against seconds of training, seeds as a band, and the best so far of all."""
     ends = []
     for i, line in enumerate(lines):
         look = style(i, theme)
@@ -264,7 +263,7 @@ FAR = 0.1
 """Share of the panel's size from which on a line leads from a point to its name."""
 ACROSS = (0.022, 0.07, 0.12, 0.17, 0.22)
 UP = (0.06, 0.0, 0.13, 0.2, 0.27, 0.34, 0.41)
-"""Distances that are tried, from near to far, as shares of the panel's width and height."""
+"""Distances that are tried, shares of the panel's width and height."""
 MARGIN = 1.15
 """Height that is left free for a name, as a multiple of its own."""
 POINT = (0.012, 0.03)
@@ -280,8 +279,7 @@ def name_points(
     colours: Sequence[str],
     others: Sequence[tuple[float, float]] = (),
 ) -> None:
-    """Writes names beside points, each where it and the line to it cover least: not others
-    either."""
+    """Writes names beside points, where they and their lines cover least, others included."""
     to_panel = axes.transData + axes.transAxes.inverted()
     taken = boxes_around(to_panel.transform([*places, *others]), *POINT)
     written = np.zeros((0, 4))
@@ -322,7 +320,7 @@ def covered(some: Boxes, others: Boxes) -> float:
 
 
 def _places_beside(point: Any, width: float, height: float) -> list[Any]:
-    """Boxes in which the name of a point may stand, the best first."""
+    """Boxes for the name of a point, the best first."""
     (x, y), half = point, MARGIN * height / 2.0
     return [
         np.array([left, middle - half, left + width, middle + half])

@@ -15,11 +15,11 @@ OUR_KIND = "MLP"
 SMALL_OURS = "small MLP (ours)"
 """The small gate of that kind, which the trained field taught."""
 SPARSE = "sparse points"
-"""What is near one of the scene's is kept. In tables, not in pictures: it mostly keeps far more."""
+"""What is near one of the scene's. In tables only: it mostly keeps far more."""
 BYTES_A_NUMBER = 2
-"""In bfloat16, in which gates are asked on a CPU."""
+"""In bfloat16."""
 COSTS = {"size": "size", "learning time": "learn_seconds"}
-"""The costs that fronts are of, and the figure of each in `Held`."""
+"""Costs of fronts, and the figure of each in `Held`."""
 AS_CHEAP = {"size": "as small", "learning time": "learned as soon"}
 """Words for what costs no more."""
 
@@ -89,10 +89,8 @@ class Representation:
 
 
 def representations_of(lines: Sequence[Line]) -> list[Representation]:
-    """Gates, and small gates and grids made from the same field, that every run has measured.
-
-    Empty where all are gates of one kind: then the chart compares something else.
-    """
+    """Gates, and small gates and grids of the same field, that every run has measured; none where
+    all are gates of one kind."""
     found: list[Representation] = []
     gates: set[str] = set()
     for line in lines:
@@ -121,8 +119,7 @@ def never_held_of(lines: Sequence[Line]) -> list[str]:
 
 
 def _held_in(run: Mapping[str, Any], line: Line) -> dict[_What, Held]:
-    """Its gate, what its field has taught, sparse points, and grids of densities by size; nothing
-    where its gate was not measured."""
+    """Its gate, and what was made from its field; nothing where its gate was not measured."""
     seconds, kept = (cost.of(run) for cost in (LEARNING, KEPT))
     if seconds is None or kept is None:
         return {}
@@ -159,10 +156,8 @@ def fronts_of(one: Representation, all_of_them: Sequence[Representation]) -> lis
 
 
 def verdict(representations: Sequence[Representation]) -> str:
-    """What of ours nothing that costs no more beats in space, and what does: by medians.
-
-    What the seeds do not tell apart is said to be level, or undecided.
-    """
+    """What of ours nothing as cheap beats in space, and what does, by medians; or that seeds do not
+    tell."""
     ours = [one for one in representations if one.ours]
     if not ours:
         return "our own gate was not frozen with every seed"
@@ -223,7 +218,7 @@ def _is_cheapest(one: Representation, others: Sequence[Representation], figure: 
 
 
 def _best_ahead(one: Representation, others: Sequence[Representation], figure: str) -> str:
-    """Of those that lead a representation, the one that keeps least, and what is level."""
+    """Of those that lead a representation, the one that keeps least."""
     leaders = [other for other in others if other.has(figure) and other.leads(one, figure)]
     best = min(leaders, key=lambda other: other.kept)
     space = best.against(one, "kept")

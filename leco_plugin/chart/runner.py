@@ -19,33 +19,24 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from leco_plugin.evaluation.report import read_object
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.locks import LOCK, alone_in
 from leco_plugin.scenes.whole_files import write_json
 
+if TYPE_CHECKING:
+    from leco_plugin.chart.contender import Job
+
 SETTINGS, RESULTS = "settings.json", "results.json"
 RUNS, UNFINISHED, LOGS = "runs", "unfinished", "logs"
 JOB, RESULT, FAILURE, PROGRESS = "job.json", "result.json", "failure.json", "progress"
 """Files in the folder of a job that is under way."""
 KEPT = ("occupancy.safetensors", "view.png")
-"""Files of a job that are kept beside its record, under its name and their ending."""
+"""Files of a job that are kept beside its record, under its name."""
 DAMAGED = "is damaged, or not of a chart; delete it, or name a new folder"
 POLL_SECONDS = 0.25
-
-
-class Job(Protocol):
-    """Something to be made once."""
-
-    @property
-    def name(self) -> str:
-        """Of its files."""
-
-    @property
-    def values(self) -> dict[str, Any]:
-        """What it is, as JSON values."""
 
 
 Runner = Callable[[Any, Callable[[float], None]], dict[str, Any]]
@@ -58,8 +49,6 @@ class RunFailed(RuntimeError):
 
 class RunFolder:
     """Finished jobs that share their settings, JSON values: one file for each.
-
-    More jobs may join later; jobs with other settings may not.
 
     Raises:
         InputError: the folder holds something else, or jobs with other settings.
@@ -74,10 +63,8 @@ class RunFolder:
 
     @contextmanager
     def alone(self) -> Iterator[None]:
-        """Keeps other processes from making jobs here, and deletes what killed ones left.
-
-        Another process that makes some is an `InputError`.
-        """
+        """Deletes what killed processes left, and keeps others from making jobs here:
+        `InputError`."""
         with alone_in(self.path, "chart"):
             self.clear()
             yield
@@ -124,7 +111,7 @@ def take_folder(
     holds: str = "a chart with another",
     damaged: str = DAMAGED,
 ) -> None:
-    """Makes the folder of a file one of the settings in that file, if it is not one already.
+    """Writes settings to a file in a new or empty folder, or checks those that it holds.
 
     Args:
         holds: what is said of a folder before the first setting that is not as wanted.
@@ -140,13 +127,6 @@ def take_folder(
         raise InputError(f"{folder} holds something else; name a new folder with --out")
     else:
         write_json(file, dict(settings))
-
-
-def read_settings(path: Path) -> dict[str, Any] | None:
-    """The settings that the jobs in a folder share; None where there are none. Damaged ones are an
-    `InputError`."""
-    file = path / SETTINGS
-    return read_object(file, DAMAGED) if file.is_file() else None
 
 
 def difference(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str | None:
@@ -183,7 +163,6 @@ def make_jobs(
         say: called with that line, in this thread.
         show: called with the share of all jobs that is done.
         stop: set when an error or Ctrl-C ends this, to end the jobs that are under way.
-        at_once: jobs at a time.
         done: jobs that were finished before.
         is_wanted: asked when a job's turn comes; one that is not is left out.
     """
@@ -307,11 +286,8 @@ def _reason(work: Path, status: int, log: Path) -> str:
 
 
 def work_on(folder: Path, make: Callable[..., dict[str, Any]]) -> int:
-    """Makes the job in a folder: the other side of `ProcessRunner`, called in its process.
-
-    `make` is called with the values of the job and what reports the share that is done. Its result
-    is left in the folder, or the reason why there is none; returns 0, or 1 on failure.
-    """
+    """Makes the job in a folder: the other side of `ProcessRunner`, called in its process. Leaves
+    the result, or the reason why there is none, and returns 0, or 1 on failure."""
     shown = 0.0
 
     def show(share: float) -> None:
@@ -335,10 +311,7 @@ def work_on(folder: Path, make: Callable[..., dict[str, Any]]) -> int:
 
 
 def die_with_parent() -> None:
-    """Ends this process when the one that started it has gone and so closed our input.
-
-    A run that nobody waits for would slow the ones that are timed.
-    """
+    """Ends this process when its parent has gone: a run that nobody waits for slows timed ones."""
 
     def wait_for_end() -> None:
         while os.read(sys.stdin.fileno(), 1):

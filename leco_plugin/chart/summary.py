@@ -18,8 +18,7 @@ from leco_plugin.evaluation.report import cores_said
 CONFIDENCE = 0.95
 """Of the interval around a difference of means; of each comparison alone, however many are made."""
 CLOSE, CLOSE_SHARE = 0.5, 0.25
-"""The widest margin with which two are level: dB, or of other figures a share of their means. With
-a wider one the seeds do not decide."""
+"""The widest margin with which two are level: dB, or a share of the means of other figures."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +55,12 @@ class Verdict:
 def compare(ours: Sequence[float], theirs: Sequence[float], close: float | None = CLOSE) -> Verdict:
     """Compares a figure of each run of two contenders by the 95% interval of Welch's t around the
     difference of their means. Where that holds zero the two are level, or, if its half is wider
-    than `close`, undecided. Swap the two for a cost.
+    than `close`, undecided. Swap the two for a cost. `ValueError` where one has no run.
+
+    Runs with the same seed share nothing but its number, so that they are no pairs.
 
     Args:
         close: in the figure's unit, PSNR by default; of None `CLOSE_SHARE` of the mean of all.
-
-    Runs with the same seed share nothing but its number, so that they are no pairs, and two
-    contenders need not scatter alike. `ValueError` where one of them has no run.
     """
     if not ours or not theirs:
         raise ValueError(f"{len(ours)} runs cannot be compared with {len(theirs)}")
@@ -172,8 +170,7 @@ class Line:
 
     @property
     def kept_up(self) -> float:
-        """Share of the training time spent on updates of an occupancy grid, median over seeds; 0
-        without a grid."""
+        """Median share of the training time spent on updates of a grid; 0 without one."""
         seconds = None if self.learned else self.median(LEARNING)
         if seconds is None:
             return 0.0
@@ -188,8 +185,8 @@ class Line:
         return middle_of([cost.of(run) for run in self.runs])
 
     def curve(self) -> tuple[NDArray[np.float64], ...]:
-        """Mean seconds [T], and mean, lowest and highest PSNR [T] over seeds at equal shares of
-        their training, the end included."""
+        """Mean seconds [T], and mean, lowest and highest PSNR [T] at equal shares of the
+        training."""
         curves = [np.array(run["curve"], dtype=float) for run in self.runs]
         ends = np.array([curve[-1, 0] for curve in curves])
         begin = max(curve[0, 0] / end for curve, end in zip(curves, ends))
@@ -213,8 +210,8 @@ class Line:
 
 
 def seconds_to_pass(curve: Sequence[Sequence[float]], psnr: float) -> float | None:
-    """When a curve [[seconds, PSNR], ...] reaches a PSNR and stays above it, interpolated. None for
-    never; the first point's seconds, at most, where no point is below."""
+    """When a curve [[seconds, PSNR], ...] reaches a PSNR and stays above it, interpolated; None for
+    never. Its first seconds where no point is below."""
     below = [i for i, (_, value) in enumerate(curve) if value < psnr]
     if not below:
         return float(curve[0][0])
@@ -250,8 +247,8 @@ def front(points: Sequence[tuple[float, float]]) -> list[int]:
 
 
 def best_so_far(lines: Sequence[Line]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The front of accuracy against training time: seconds [T], and the highest mean PSNR that any
-    contender has reached by then [T]."""
+    """Seconds [T] of training, and the highest mean PSNR [T] that any contender has reached by
+    then."""
     curves = [line.curve()[:2] for line in lines]
     times = np.unique(np.concatenate([seconds for seconds, _ in curves]))
     reached = [np.interp(times, seconds, psnr, left=-np.inf) for seconds, psnr in curves]
@@ -316,8 +313,7 @@ def circumstances(results: Mapping[str, Any]) -> str:
 
 
 def seeds_said(results: Mapping[str, Any]) -> str:
-    """The least and the most seeds of a contender, and how many runs failed, such as "2 to 5 seeds;
-    3 runs failed"."""
+    """Seeds of a contender, and how many runs failed, as "2 to 5 seeds; 3 runs failed"."""
     counts = [len(line.runs) for line in lines_of(results)]
     least, most = min(counts), max(counts)
     said = "one seed" if most == 1 else f"{most} seeds" if least == most else ""
@@ -334,7 +330,7 @@ class Versus:
     theirs: str
     psnr: Verdict
     passed: tuple[float | None, ...]
-    """Seconds of training, learning included, after which it passes the other's mean last PSNR."""
+    """Seconds of training after which it passes the other's mean last PSNR."""
     sooner: tuple[float | None, ...]
     """The other's median training time as a multiple of those seconds."""
     faster: tuple[float, ...]
@@ -344,7 +340,7 @@ class Versus:
 
 
 def versus(ours: Line, theirs: Line, seconds: float | None) -> Versus:
-    """Compares the runs of two contenders; a last step beyond `seconds` of each does not count."""
+    """Compares two contenders; a last step beyond `seconds` of each does not count."""
     most = seconds or math.inf
     curves = [run["curve"] for run in theirs.runs]
     last = statistics.fmean(curve[-1][1] for curve in curves)

@@ -50,12 +50,10 @@ DARK = Theme(
 
 
 def style(i: int, theme: Theme) -> dict[str, Any]:
-    """Colour and marker of the line of a number."""
     return {"color": theme.colours[i % len(theme.colours)], "marker": MARKERS[i % len(MARKERS)]}
 
 
 def plain(axes: Any, theme: Theme) -> None:
-    """Gives axes a faint grid and no frame above and to the right."""
     axes.grid(color=theme.faint, linewidth=0.8)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
@@ -92,7 +90,6 @@ def new_figure(size: tuple[float, float], page: str = LIGHT.page, **options: Any
 
 
 def save_picture(figure: Any, path: Path, results: Any, dpi: int) -> Path:
-    """Saves a figure with the fingerprint of the results that it shows."""
     figure.savefig(path, dpi=dpi, metadata={SOURCE: fingerprint(results)})
     return path
 

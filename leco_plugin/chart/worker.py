@@ -25,11 +25,10 @@ SMALL_GATES = {
     "TensoRF planes": "vm-32-4",
     "K-planes": "k-planes-32-4-1",
 }
-"""A gate of each kind that keeps little for its bytes in `leco capacity`: 5 to 27 kB."""
+"""Gates that keep little for their bytes in `leco capacity`."""
 TAUGHT_GRIDS = (32, 64, 128, 256)
-"""Cells along an axis of grids that are taught as small gates are."""
+"""Cells along an axis."""
 BYTES_A_POINT = 6
-"""Its three numbers in half precision."""
 
 
 def run_job(
@@ -64,11 +63,9 @@ def train_job(
 
     Args:
         folder: for the occupancy, if there is one, and for nerfstudio's own files.
-        on_progress: called with the share that is done.
         looked_at: False leaves the test images, and all figures of them, to the caller.
     Returns:
-        A run of `results.json`, with an `occupancy` of its own, as JSON values; and the trainer
-        with its model.
+        A run of `results.json`, with its `occupancy`, as JSON values; and the trainer.
     """
     from leco_plugin.evaluation.timed_run import timed_run
     from leco_plugin.models.leco import LecoModel
@@ -107,9 +104,7 @@ def _at_freezing(
     trainer: Trainer, frozen: dict[str, Any], contender: Contender
 ) -> dict[str, Any] | None:
     """What `compare_at_freezing` finds with the weights of the moment of freezing; None without.
-
-    Measured after the run, so that neither its time nor its random numbers change.
-    """
+    Measured after the run, so that neither its time nor its random numbers change."""
     if not frozen:
         return None
     model: Any = trainer.pipeline.model
@@ -133,10 +128,10 @@ def compare_at_freezing(model: Any, datamanager: Any, contender: Contender) -> d
     """What the gate keeps at equal loss, beside grids and small gates made from the same field.
 
     Returns:
-        As `at_equal_loss`. Where the contender asks for small gates, `taught` holds for each of
-        `SMALL_GATES` its `name`, its `bytes`, the `seconds` of teaching it, and what it keeps; and
-        `others` holds the same of grids that had the same lesson, and of the scene's sparse points:
-        what lies near one is kept. `learned_first` says whether the field is needed.
+        As `at_equal_loss`. For a contender with small gates, `taught` holds for each of
+        `SMALL_GATES` its `name`, `bytes`, `seconds` of teaching and what it keeps; `others` the
+        same of grids that had the same lesson, and of what lies near the scene's sparse points.
+        `learned_first` says whether the field is needed.
     Raises:
         ValueError: held-out rays see no surface.
     """

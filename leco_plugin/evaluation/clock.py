@@ -20,8 +20,7 @@ RESET_PEAK = "5"
 
 
 def seconds_now() -> float:
-    """Of the process, where it works on a CPU in one thread: other processes on the machine do not
-    lengthen them. Of the wall's clock elsewhere; only differences mean something."""
+    """Of the process, where it works on a CPU in one thread; of the wall's clock elsewhere."""
     alone = not torch.cuda.is_available() and torch.get_num_threads() == 1
     return time.process_time() if alone else time.perf_counter()
 
@@ -82,11 +81,9 @@ class Budget:
     """When a run is over: after so much time or so many steps, whichever comes first."""
 
     seconds: float | None = None
-    """Training time."""
     steps: int | None = None
-    """Training steps."""
     learn_seconds: float | None = None
-    """Limit, about, for learning an occupancy; None leaves it to the method."""
+    """Limit, about, for learning an occupancy."""
 
     def __post_init__(self) -> None:
         if self.seconds is None and self.steps is None:
@@ -103,11 +100,8 @@ class Budget:
 
 
 def peak_process_bytes() -> int:
-    """Highest resident memory of this process so far.
-
-    The kernel's own mark where there is one: `getrusage` starts with the peak of the process that
-    started this one.
-    """
+    """Highest resident memory of this process: the kernel's mark, for `getrusage` starts with the
+    peak of the parent."""
     try:
         for line in STATUS.read_text().splitlines():
             if line.startswith("VmHWM:"):
@@ -121,8 +115,7 @@ def peak_process_bytes() -> int:
 
 
 def forget_peaks() -> bool:
-    """Makes later peaks those of what follows; returns whether the system can do so. What is still
-    in use counts."""
+    """Makes later peaks those of what follows, if the system can do so."""
     gc.collect()
     with suppress(OSError, AttributeError):  # no glibc
         ctypes.CDLL("libc.so.6").malloc_trim(0)  # our models on a CPU keep memory that is free

@@ -40,11 +40,11 @@ from leco_plugin.scenes.learning_data import held_out_rays
 
 CALIBRATION = CalibrationConfig()
 LOST_SURFACE_MASS = 1e-3
-"""Share of the weight near surfaces that each representation loses."""
+"""Share of the weight near surfaces."""
 VOLUME_POINTS = 1 << 17
 """Positions drawn in the whole box, of which rays reach some."""
 TAUGHT_RAYS = 1 << 15
-"""Rays of photographs that say what is reached, and of whose densities grids hear."""
+"""Rays of photographs that say what is reached."""
 CELLS = 64
 """Along an axis of the mapped cube: a cell is reached if it holds a candidate of those rays."""
 MOST_ON_CPU = 2e8
@@ -69,8 +69,7 @@ def kept_shares(
     """Shares of the volume and of the candidates that are kept where a share of weight is lost.
 
     Args:
-        weights: [M] of candidates, near surfaces.
-        scores: [M] of the candidates.
+        weights, scores: [M] of candidates; weights are those near surfaces.
         of_volume: [P] scores of places spread evenly over what rays reach of the scene's box.
         lost: share of the weight.
     """
@@ -89,8 +88,8 @@ def at_equal_loss(
 ) -> dict[str, Any]:
     """What the mixture's gate keeps at `LOST_SURFACE_MASS`, and grids made from the same field.
 
-    Meant for the mixture at the moment of freezing: later its field is trained only where the gate
-    keeps. Grids hear of the densities along rays, as a gate does, beside random places.
+    Meant for the moment of freezing: later the field is trained only where the gate keeps. Grids
+    hear of the densities along rays, as a gate does, beside random places.
 
     Args:
         mixture: whose gate is frozen; it is left as it was.
@@ -99,12 +98,10 @@ def at_equal_loss(
             the scores [n, n, n] of a grid in `mapped_box`.
     Returns:
         `lost_surface_mass`; `reached_volume`, the share of the scene's box that rays reach;
-        `kept_reached_volume` and `kept_candidates`, shares of that and of the candidates between
-        near and far; `grids`, the same for each with its `resolution`, its `bytes` at one bit a
-        cell, its `octree_bytes`, the `update_seconds` that it took beyond the field, coarser grids
-        included, and whether it keeps least `dilated` by a cell; `others`, what each keeps if there
-        are any, and of a grid what is said of `grids` too; and
-        `left_out`, resolutions that would not fit the free memory, or take minutes of a CPU.
+        `kept_reached_volume` and `kept_candidates`, shares of that and of the candidates; `grids`,
+        the same with `resolution`, `bytes` at one bit a cell, `octree_bytes`, `update_seconds` with
+        those of coarser grids, and whether it keeps least `dilated` by a cell; `others`; and
+        `left_out`, resolutions without memory or time for them.
     Raises:
         ValueError: held-out rays see no surface.
     """
@@ -157,8 +154,7 @@ def near_points(points: Tensor) -> Callable[[Tensor], Tensor]:
 def _kept_by_grid(
     weights: Tensor, box: ViewBox, mapped: Tensor, volume: Tensor, scores: Tensor
 ) -> dict[str, Any]:
-    """What a grid of scores [nx, ny, nz] keeps, as it is or dilated, whichever keeps less; and its
-    bytes as an octree, where it is a cube."""
+    """What a grid of scores [nx, ny, nz] keeps, as it is or dilated, and its bytes as an octree."""
     both = []
     for dilated, cells in enumerate((scores, dilate(scores))):
         of_rays, of_volume = (look_up_scores(cells, box, places) for places in (mapped, volume))
@@ -177,8 +173,7 @@ def _grids_of(
     mapped: Tensor,
     weights: Tensor,
 ) -> Iterator[tuple[dict[str, Any], Tensor | None]]:
-    """Facts and scores of grids of the mixture's field, which hear of its density at the places
-    `taught` [M, 3]; without scores where there is no memory or no time for them."""
+    """Facts and scores of grids of the field; without scores where there is no memory or time."""
     if not resolutions:
         return
     box = mapped_box(mixture)
@@ -206,8 +201,7 @@ def _grids_of(
 def _measured(
     mixture: Mixture, datamanager: Any, config: CalibrationConfig
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Candidates of held-out rays before the backdrop: mapped [M, 3], weights near surfaces [M],
-    and o(x) [M]."""
+    """Candidates of held-out rays: mapped [M, 3], weights near surfaces [M], and o(x) [M]."""
     rays, _ = held_out_rays(mixture, datamanager, config.rays)
     pieces = []
     for some in in_chunks(rays, config.rays_at_once):
@@ -227,10 +221,8 @@ def mapped_box(mixture: Mixture) -> ViewBox:
 
 
 def reached_volume(mixture: Mixture, taught: Tensor, count: int, seed: int = 0) -> Tensor:
-    """Mapped positions spread evenly over what rays reach of the scene's box: [P, 3], P <= count.
-
-    Rays reach the cells of their mapped candidates `taught` [M, 3].
-    """
+    """Mapped positions [P, 3], P <= count, in the cells of mapped candidates `taught` [M, 3] of
+    rays."""
     positions = whole_box(mixture.occupancy()).draw(count, seed).to(mixture.device)
     mapped = mixture.region.space.map(positions).clamp(-1.0, 1.0)
     return mapped[reached(taught, mapped)]
@@ -249,8 +241,7 @@ def reached(taught: Tensor, mapped: Tensor) -> Tensor:
 
 
 def rays_of_photographs(datamanager: Any, count: int, seed: int = 0) -> RayBundle:
-    """Rays anywhere in the training photographs; pixels and random numbers of training are not
-    touched."""
+    """Rays anywhere in the training photographs, without random numbers of training."""
     cameras = datamanager.train_dataset.cameras.to("cpu")
     generator = torch.Generator().manual_seed(seed)
     numbers = torch.randint(len(cameras), (count, 1), generator=generator)
@@ -279,7 +270,7 @@ FROM_REPORT = (
 )
 MOST_SURFACE_POINTS = 100_000
 AIR_POINTS = 50_000
-"""Positions drawn over the city; those in or near matter are then left out."""
+"""Positions drawn over the city, matter included."""
 
 
 def truth_of(folder: Path, manager: Any) -> CityTruth | None:
@@ -292,10 +283,8 @@ def truth_of(folder: Path, manager: Any) -> CityTruth | None:
 def occupancy_facts(
     occupancy: Occupancy, file: Path, manager: Any, truth: CityTruth | None
 ) -> dict[str, Any]:
-    """Sizes, calibration, and the comparison with the exact scene: JSON values, None without one.
-
-    The occupancy, of a file, and the truth are in the coordinates of the data manager.
-    """
+    """Sizes, calibration, and the comparison with the exact scene, which has the same coordinates
+    as the data manager: JSON values, None without one."""
     report = occupancy.report
     measured: dict[str, Any] = {"kept_surface_recall": None, "free_space_skipped": None}
     if truth is not None:
@@ -314,15 +303,12 @@ def compare_with_truth(
     """What an occupancy keeps of the surfaces of the city, and skips of its air.
 
     Args:
-        occupancy: on any device.
         truth: the city in the model's coordinates.
         aabb: [6] the box in which rays are marched, scene units; far walls are no limit.
-        step_size: of marching, scene units.
-        highest: z of the highest camera, scene units.
+        step_size, highest: of marching; z of the highest camera, scene units.
     Returns:
         `kept_surface_recall`: share of the surface points in the middle of the test pixels that
-        are kept; `free_space_skipped`: share of the points of `free_points` that are skipped. None
-        where there is no such point.
+        are kept; `free_space_skipped`: share of `free_points` that are skipped; or None.
     """
     surface = truth.visible_surface("test")
     order = torch.randperm(len(surface), generator=torch.Generator().manual_seed(0))
@@ -341,7 +327,7 @@ def free_points(
     Args:
         surface: [P, 3] visible surface points, whose extent is that of the city.
     Returns:
-        [F, 3], all inside `aabb`, outside matter, and farther than a step from every surface.
+        [F, 3] inside `aabb`, outside matter, and farther than a step from every surface.
     """
     aabb = aabb.detach().cpu()
     low, high = surface.amin(dim=0), surface.amax(dim=0)

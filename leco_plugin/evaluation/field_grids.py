@@ -1,8 +1,5 @@
-"""Occupancy grids of a trained field, each refined from one half as fine.
-
-Densities are evaluated only in cells that the coarser grid, or a neighbour there, has not ruled
-out. The time for 512^3 cells therefore depends on how much surface they hold.
-"""
+"""Occupancy grids of a trained field, each refined from one half as fine, which has ruled out
+cells: the time for 512^3 depends on how much surface they hold."""
 
 from __future__ import annotations
 
@@ -22,11 +19,10 @@ from leco_plugin.occupancy import gate_precision
 from leco_plugin.samplers.boxes import cells_of
 
 FEWEST_PROBES, PROBES_ALONG = 8, 2048
-"""Densities evaluated at random places of a cell; the largest is its score. More in coarse cells,
-of which a surface may fill a corner."""
+"""Densities evaluated at random places of a cell; more in coarse cells."""
 CELLS_AT_ONCE = 1 << 18
 BYTES_A_CELL = 16
-"""Of memory while a grid is filled, about."""
+"""Of memory."""
 ASK_ALL = 64
 """Cells along an axis up to which a grid may be filled without a coarser one."""
 
@@ -38,8 +34,8 @@ class FieldGrids:
     """Grids of one field in a box of mapped coordinates, from coarse to fine.
 
     Args:
-        known: mapped positions [M, 3] and densities [M] that count too: hundreds of random places
-            miss a surface that fills a thousandth of a cell.
+        known: mapped positions [M, 3] and densities [M] that count too: random places miss a
+            surface that fills a thousandth of a cell.
         floor_of: gives, for the scores [nx, ny, nz] of a grid, the score below which a cell and
             its neighbours are empty in finer grids too.
         most: densities that may be evaluated for one grid.
@@ -61,10 +57,8 @@ class FieldGrids:
         """The time of the last grid, including those that it was refined from."""
 
     def fill(self, sizes: Sequence[int]) -> Tensor | None:
-        """Scores [nx, ny, nz] of a grid of so many cells; None where it would ask more than `most`.
-
-        The grid filled before is refined if it is half as fine.
-        """
+        """Scores [nx, ny, nz] of a grid, refined from the one before if that is half as fine; None
+        where it would ask more than `most`."""
         steps = halvings(sizes, () if self.scores is None else self.scores.shape)
         if self.scores is None or tuple(2 * n for n in self.scores.shape) != steps[0]:
             self.scores, self.floor, self.clock = None, 0.0, Clock()
@@ -98,11 +92,7 @@ def cells_to_ask(
     floor: float = 0.0,
     device: torch.device | str = "cpu",
 ) -> Tensor:
-    """Cells of a grid whose density is not known yet: bool [nx, ny, nz].
-
-    Without scores of a coarser grid, half as fine, that is every cell. A cell below the floor there
-    is taken for empty with all around it.
-    """
+    """Cells not known to be empty by a coarser grid's scores, half as fine: bool [nx, ny, nz]."""
     if coarser is None:
         return torch.ones(*sizes, dtype=torch.bool, device=device)
     near = dilate(coarser) >= floor
@@ -110,15 +100,14 @@ def cells_to_ask(
 
 
 def probes_in_a_cell(sizes: Sequence[int]) -> int:
-    """Random places at which a cell is asked, of a grid with so many cells along each axis."""
     return max(FEWEST_PROBES, PROBES_ALONG // max(sizes))
 
 
 def fill_cells(
     density: Density, box: ViewBox, asked: Tensor, known: tuple[Tensor, Tensor] | None = None
 ) -> Tensor:
-    """Scores [nx, ny, nz] of cells, zero where they are neither asked, bool [nx, ny, nz], nor
-    known: mapped positions [M, 3] and densities [M]."""
+    """Scores [nx, ny, nz] of cells, zero where neither asked nor known: positions, densities
+    [M]."""
     device = box.low.device
     scores = torch.zeros(asked.shape, device=device)
     counts = torch.tensor(asked.shape, device=device)
@@ -142,10 +131,7 @@ def largest_in_cells(scores: Tensor, box: ViewBox, mapped: Tensor, values: Tenso
 
 
 def dilate(scores: Tensor) -> Tensor:
-    """Each cell with the score of its largest neighbour: [nx, ny, nz].
-
-    Random places in a small cell miss what is dense there, and a gate is taught a margin too.
-    """
+    """Each cell with the score of its largest neighbour: a gate is taught a margin too."""
     return max_pool3d(scores[None, None], 3, stride=1, padding=1)[0, 0]
 
 

@@ -20,24 +20,21 @@ from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler
 from leco_plugin.studio.host_models import true_colours
 
 FIRST_AFTER, BETWEEN = 8.0, 10.0
-"""Seconds before PSNR is measured first, and the fewest between two measurements."""
+"""Seconds before the first measurement, and between two."""
 SHARE_OF_TIME = 0.01
-"""Of the time so far that all measurements may have taken; the first and the last may exceed it."""
+"""Of the time so far; the first and the last measurement may exceed it."""
 OLD, SHARE_WHEN_OLD = 30.0, 0.03
-"""Seconds after which PSNR is measured again where that takes at most so much of them."""
+"""Seconds after which PSNR is measured at so much of them."""
 RAYS, FEWEST_LAST, MOST_LAST = 256, 1024, 8192
-"""Rays of a measurement; of the last one, the fewest and the most."""
+"""Rays of a measurement; fewest and most of the last."""
 OF = "on held-out pixels"
 TEST_PHOTOGRAPHS = 8
 """That are looked at when a run is over."""
 
 
 class HeldOutPsnr:
-    """Measures the PSNR of nerfstudio's model on pixels of the training photographs of its data
-    manager that no step trains on.
-
-    The model is trained exactly as it would be without. All measurements but the last are of the
-    same pixels.
+    """Measures the PSNR of nerfstudio's model on pixels that no step trains on, the same but for
+    the last time. The model is trained exactly as it would be without.
 
     Attributes:
         latest: dB, None until it was measured.
@@ -54,7 +51,6 @@ class HeldOutPsnr:
         self.pixels: tuple[RayBundle, Tensor] | None = None
 
     def begin(self) -> None:
-        """The time that counts begins now."""
         self.began = time.monotonic()
         self.due = self.began + FIRST_AFTER
 
@@ -80,11 +76,8 @@ class HeldOutPsnr:
         return self._measure(max(FEWEST_LAST, min(affordable, MOST_LAST)))
 
     def _measure(self, count: int) -> int:
-        """Measures on so many pixels, or as many as there are; returns how many.
-
-        One ray comes before the clock starts: where the occupancy has changed, it makes the model
-        build the sampler that the next step takes as well, in seconds.
-        """
+        """Measures on up to so many pixels; returns how many. One ray comes before the clock
+        starts: a changed occupancy makes the model build a sampler, in seconds."""
         began = time.monotonic()
         if self.pixels is None or count != RAYS:  # of so many, the same are drawn once
             self.pixels = held_out_bundle(self.manager, count, share="all")
@@ -103,8 +96,8 @@ class HeldOutPsnr:
 
     @torch.no_grad()
     def _psnr_of(self, pixels: list[tuple[RayBundle, Tensor]]) -> float:
-        """PSNR of rendered rays, by chunks with their true colours [R, 3 or 4]; notes that of their
-        mean colour."""
+        """PSNR of rendered rays, by chunks with true colours [R, 3 or 4]; notes that of their
+        mean."""
         device = self.model.device
         cards = [device] if torch.device(device).type == "cuda" else []
         with torch.random.fork_rng(cards), evaluating(self.model):
@@ -121,11 +114,8 @@ class HeldOutPsnr:
         return "" if self.latest is None else f"{self.latest:.1f} dB {OF}"
 
     def look_at_tests(self) -> float | None:
-        """PSNR on pixels of up to `TEST_PHOTOGRAPHS` test photographs; None where there are none.
-
-        They are new views: a field can be good on pixels of photographs that it was trained on, and
-        fail there. From now on they are those that `of_one_colour` is of.
-        """
+        """PSNR on pixels of up to `TEST_PHOTOGRAPHS` test photographs, which are new views; None
+        without any. From now on `of_one_colour` is of them."""
         dataset: Any = getattr(self.manager, "eval_dataset", None)
         if dataset is None or len(dataset) == 0:
             return None

@@ -31,12 +31,12 @@ STILL, MOST_FRAMES = 4, 12
 FRAME_PIXELS = 300
 """Along the longer side of a slice."""
 FRAME_COLOURS = 255
-"""Of a picture that moves, the same in all its frames; GIF keeps one more for what stays."""
+"""Of a picture that moves."""
 FRAME, LAST_FRAME = 250, 3000
 """Milliseconds for which a frame is shown."""
 DPI = 80
 OPAQUE = 1e4
-"""Density, per half extent, that is drawn for more: opaque within a ten-thousandth."""
+"""Density, per half extent, that is drawn for more."""
 
 
 def draw_history(occupancy: Occupancy, folder: Path, path: Path) -> Path:
@@ -71,7 +71,6 @@ def write_film(
     """Writes a GIF that repeats. All frames share one palette, so that a colour never changes.
 
     Args:
-        frames: RGB pictures of one size.
         durations: in milliseconds, of all frames or of each.
         colours: in the palette. There is no dither, which GIF cannot compress.
     """
@@ -115,7 +114,6 @@ class _Film:
         low, high = heights_seen_from_above(occupancy, self.box)
         middle = middle_of(surface_points(occupancy, self.box, low)[0], self.box)
         self.places = ((2, low + HORIZONTAL[0] * (high - low)), (1, float(middle[1])))
-        """The normal of each slice and its position along that."""
         self.shares = torch.stack(history.shares).numpy()
         self.densities = torch.stack(history.densities).clamp(max=OPAQUE).numpy()
 

@@ -97,8 +97,7 @@ def describe(occupancy: Occupancy) -> dict[str, Any]:
 
 
 def doubts(facts: dict[str, Any]) -> list[str]:
-    """What was said at the end of its run, or when the occupancy was frozen, if it or its field are
-    of no use; `facts` are of `describe`."""
+    """What was said of a useless occupancy or field; `facts` are of `describe`."""
     found: list[str] = []
     report = facts["report"]
     at_end = report.get(AT_END)
@@ -125,8 +124,7 @@ def whole_box(occupancy: Occupancy) -> ViewBox:
 
 
 def mapped_box(occupancy: Occupancy) -> ViewBox:
-    """The part of the gate's cube in which it was taught, on the CPU; all of it where the scene is
-    unbounded."""
+    """The part of the gate's cube in which it was taught, on the CPU."""
     if occupancy.space.kind != "box":
         return ViewBox(-torch.ones(3), torch.ones(3))
     box = whole_box(occupancy)
@@ -170,10 +168,8 @@ def scene_of(occupancy: Occupancy, file: Path, data: Path | None) -> Path | None
 
 
 def to_the_data(occupancy: Occupancy) -> Tensor | None:
-    """Takes positions of the run to those that the data's own files have: [3, 4] float64.
-
-    None where the file does not say how its run turned, moved and scaled the data.
-    """
+    """Takes positions of the run to those of the data's own files: [3, 4] float64, None if
+    unknown."""
     frame = occupancy.report.get("data_frame") or occupancy.report.get("frame")
     rows = [numbers(row) for row in frame] if isinstance(frame, list) else []
     if [len(row) for row in rows] != [4, 4, 4]:
@@ -217,11 +213,8 @@ def in_parts(function: Callable[[Tensor], Tensor], positions: Tensor) -> Tensor:
 
 
 def exposed(kept: Tensor, beyond: bool = False) -> Tensor:
-    """Kept cells with at least one skipped neighbour of six: bool [X, Y, Z], as `kept`.
-
-    Args:
-        beyond: whether what lies beyond the cells counts as kept.
-    """
+    """Kept cells with a skipped neighbour of six: bool [X, Y, Z]. What lies beyond counts as
+    `beyond`."""
     skipped = torch.nn.functional.pad(~kept, (1, 1) * 3, value=not beyond)
     shifts = [skipped.roll(step, axis) for axis in range(3) for step in (-1, 1)]
     return kept & torch.stack(shifts).any(dim=0)[1:-1, 1:-1, 1:-1]
@@ -240,11 +233,7 @@ class SceneColours(NamedTuple):
 
 
 def scene_colours(occupancy: Occupancy, description: Path | None) -> SceneColours | None:
-    """Colours by a scene's transforms.json; None where points, colours or coordinates are unknown.
-
-    Raises:
-        InputError: the file of the points cannot be read.
-    """
+    """Colours by a scene's transforms.json; None if unknown, `InputError` for unreadable points."""
     points = None if description is None else coloured_points(description)
     back = to_the_data(occupancy)
     return None if points is None or back is None else SceneColours(points, back)
@@ -264,14 +253,12 @@ def ray_states(
     directions: Tensor,
     crop: tuple[Tensor | None, Tensor | None] = (None, None),
 ) -> Tensor:
-    """The state of each ray: `KEPT` where any candidate is kept; else `UNSEEN` where any lies in
-    space that no training ray crosses; else `SKIPPED`.
+    """The state [R] of each ray: `KEPT` where any candidate is kept; else `UNSEEN` where any lies
+    in space that no training ray crosses; else `SKIPPED`.
 
     Args:
         origins, directions: [R, 3] in the occupancy's coordinates, unit vectors.
         crop: nears and fars of the rays, [R] or [R, 1], scene units; None is no crop.
-    Returns:
-        [R] int64.
     """
     of_ray, starts, ends = candidates(occupancy, origins, directions, crop)
     middles = (0.5 * (starts + ends))[:, None]

@@ -1,8 +1,5 @@
-"""PSNR, SSIM, FLIP and LPIPS of one rendered image.
-
-FLIP and LPIPS are loaded at their first use and are never fetched: on a machine without the package
-of the one or the weights of the other it is left out, with one warning that says what to do.
-"""
+"""PSNR, SSIM, FLIP and LPIPS of one rendered image; the last two, if missing, are left out with one
+warning that says what to do."""
 
 from __future__ import annotations
 
@@ -31,12 +28,8 @@ class FigureUnavailable(UserWarning):
 
 
 def image_metrics(predicted: Tensor, truth: Tensor) -> dict[str, float]:
-    """The figures that ns-eval averages over images, of colours in 0..1, both [H, W, 3] float.
-
-    Returns:
-        `psnr` (dB), `ssim`, and `flip` and `lpips` where they are at hand. The key is absent
-        otherwise: nerfstudio turns every value into a float, and a NaN is no JSON.
-    """
+    """The figures that ns-eval averages over images, of colours in 0..1, both [H, W, 3] float:
+    `psnr` (dB), `ssim`, and `flip` and `lpips` where they are at hand, as a NaN is no JSON."""
     metrics = {"psnr": psnr(predicted, truth), "ssim": ssim(predicted, truth)}
     distances = {"flip": flip(predicted, truth), "lpips": lpips(predicted, truth)}
     return metrics | {name: value for name, value in distances.items() if value is not None}
@@ -53,11 +46,8 @@ def psnr(predicted: Tensor, truth: Tensor) -> float:
 
 
 def ssim(predicted: Tensor, truth: Tensor) -> float:
-    """Structural similarity of two [H, W, 3] images, at most 1, as nerfstudio's models compute it.
-
-    They leave the data range to torchmetrics, which takes it from the two images: kept, so that a
-    figure of ours stands beside one of a built-in method.
-    """
+    """Structural similarity of two [H, W, 3] images, at most 1, as nerfstudio's models compute it:
+    torchmetrics takes the data range from the two images."""
     from torchmetrics.functional.image import structural_similarity_index_measure
 
     similarity = structural_similarity_index_measure(_batched(predicted), _batched(truth))
@@ -66,8 +56,8 @@ def ssim(predicted: Tensor, truth: Tensor) -> float:
 
 
 def flip(predicted: Tensor, truth: Tensor) -> float | None:
-    """Mean FLIP of two [H, W, 3] images in 0..1, at its own default of 67 pixels per degree: 0 for
-    equal images, at most 1; None without the package `flip-evaluator`."""
+    """Mean FLIP of two [H, W, 3] images in 0..1, at 67 pixels per degree: 0 for equal images, at
+    most 1; None without the package `flip-evaluator`."""
     evaluate = flip_evaluator()
     if evaluate is None:
         return None

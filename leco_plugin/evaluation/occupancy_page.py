@@ -28,21 +28,19 @@ from leco_plugin.evaluation.occupancy_picture import (
 from leco_plugin.occupancy import Occupancy
 
 CELLS = (128, 96, 72, 48, 32)
-"""Along the longest side of the kept volume: the most with which there are few enough faces."""
+"""Along the longest side."""
 MOST_FACES = 60_000
 SEEN_CELLS = 32
 COLOURS = 256
-"""Of a palette: a colour by its number takes a byte for each face."""
+"""Of a palette."""
 CORNERS = torch.tensor([[0, 0], [1, 0], [1, 1], [0, 1]])
 EYE = {"eye": {"x": 0.9, "y": -1.2, "z": 1.0}, "center": {"x": 0.0, "y": 0.0, "z": -0.1}}
 LIGHTING = {"ambient": 0.85, "diffuse": 0.4, "specular": 0.02, "fresnel": 0.0}
 
 
 def write_page(occupancy: Occupancy, path: Path, colours: SceneColours | None = None) -> Path:
-    """Writes the page: one file that needs no network.
-
-    It shows the faces of kept cells, the cameras, the box of the occupancy, and space that no
-    photograph shows, all in the coordinates of the run. A click on a name hides or shows a part.
+    """Writes the page: one file that needs no network, in the coordinates of the run. A click on a
+    name hides or shows a part.
 
     Args:
         colours: of the scene; None colours by height.
@@ -84,12 +82,8 @@ def write_page(occupancy: Occupancy, path: Path, colours: SceneColours | None = 
 
 
 def faces_of(inside: Tensor, box: ViewBox, beyond: bool) -> Tensor:
-    """Faces between cells that are inside a set and those that are not: corners [F, 4, 3].
-
-    Args:
-        inside: bool [X, Y, Z], of the cells of a box.
-        beyond: whether cells beyond the box count as inside.
-    """
+    """Faces [F, 4, 3] between cells inside, bool [X, Y, Z], and others; outside counts as
+    `beyond`."""
     counts = torch.tensor(inside.shape)
     framed = torch.nn.functional.pad(inside, (1, 1) * 3, value=beyond)
     found = []
@@ -105,8 +99,7 @@ def faces_of(inside: Tensor, box: ViewBox, beyond: bool) -> Tensor:
 
 
 def _kept_faces(occupancy: Occupancy, box: ViewBox, lowest: float) -> Tensor:
-    """Faces [F, 4, 3] of kept cells, without what is below the ground, in cells as small as
-    `MOST_FACES` allows."""
+    """Faces [F, 4, 3] of kept cells above the ground, as small as `MOST_FACES` allows."""
     for cells in CELLS:
         positions = box.middles(cells)
         kept = query(occupancy, positions) >= occupancy.threshold

@@ -33,15 +33,14 @@ CELLS = 128
 PIXELS = 640
 """Along the longer side of a slice."""
 DPI = 160
-"""Pixels an inch of a picture, so that its letters can be read at the width of a page."""
+"""Pixels an inch."""
 MOST_POINTS = 50_000
 HORIZONTAL = (0.12, 0.4)
-"""Heights of the horizontal slices, as shares of the way from the ground to the highest roofs:
-those of a history, and of a picture where no two heights differ."""
+"""Heights of horizontal slices, as shares of the way from the ground to the highest roofs."""
 LAYERS, LAYER_CELLS = 24, 96
-"""Heights that are compared for the slices of a picture, and cells along the longest side."""
+"""Heights that are compared, and cells along the longest side."""
 FLAT = 0.25
-"""Height of a slice, in widths, below which heights are drawn longer, up to this."""
+"""Height of a slice, in widths, up to which heights are drawn longer."""
 TYPE = 10.0
 """Points."""
 UNSEEN = "#8a8f98"
@@ -78,7 +77,6 @@ def draw(
 def _figure(
     occupancy: Occupancy, cameras: Tensor | None, colours: SceneColours | None, theme: Theme
 ) -> Any:
-    """What `draw` writes."""
     cameras = cameras_of(occupancy) if cameras is None else cameras.detach().cpu().float()
     box = interesting_box(occupancy, cameras)
     low, high = heights_seen_from_above(occupancy, box)
@@ -193,8 +191,7 @@ def interesting_box(occupancy: Occupancy, cameras: Tensor) -> ViewBox:
 
 
 def heights_seen_from_above(occupancy: Occupancy, box: ViewBox) -> tuple[float, float]:
-    """Heights, scene units, between which lies nearly all that a view straight down shows, without
-    what is kept below the ground."""
+    """Heights, scene units, of nearly all that a view straight down shows."""
     _, positions, kept = _kept_cells(occupancy, box, CELLS)
     heights = torch.where(kept, positions[..., 2], -torch.inf).amax(dim=-1)
     heights = heights[heights.isfinite()].sort().values
@@ -208,8 +205,7 @@ def heights_seen_from_above(occupancy: Occupancy, box: ViewBox) -> tuple[float, 
 def differing_heights(
     occupancy: Occupancy, box: ViewBox, low: float, high: float
 ) -> tuple[float, float]:
-    """Two heights between `low` and `high`, scene units, in whose layers most decisions differ;
-    those of `HORIZONTAL` where fewer than two layers both keep and skip."""
+    """Two heights in whose layers most decisions differ; those of `HORIZONTAL` if few do."""
     heights = torch.linspace(low, high, LAYERS)
     x, y = (box.axis(a, count) for a, count in enumerate(box.cells(LAYER_CELLS)[:2]))
     positions = torch.stack(torch.meshgrid(heights, x, y, indexing="ij"), dim=-1)[..., [1, 2, 0]]

@@ -53,15 +53,14 @@ def describe_machine() -> dict[str, Any]:
 
 
 def cores_said(machine: Mapping[str, Any]) -> str:
-    """The CPU cores that a run used, in words: as many as its threads, and no more than there
-    are."""
+    """The CPU cores that a run used, in words: as many as its threads, if there are."""
     cores = min(machine["cores"], machine["threads"])
     return "one CPU core" if cores == 1 else f"{cores} CPU cores"
 
 
 def describe_code() -> dict[str, Any]:
-    """Version of this package, the commit if it is run from a checkout, and a digest of its files,
-    which shows uncommitted changes. To be called before a measurement."""
+    """Version of this package, commit of its checkout, and a digest of its files, which shows
+    changes. To be called before a measurement."""
     from leco_plugin import __version__
 
     command = ["git", "-C", str(PACKAGE), "rev-parse", "--short=12", "HEAD"]

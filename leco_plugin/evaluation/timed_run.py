@@ -57,21 +57,21 @@ class TimedRun:
     steps: int = 0
     train_seconds: float = 0.0
     step_seconds: float | None = None
-    """Median of a step once there is an occupancy, if there is ever one."""
+    """Median of a step, once there is an occupancy if ever."""
     learn_seconds: float | None = None
-    """Of the training time: until there was an occupancy, or all updates of a grid."""
+    """Until there was an occupancy, or of all updates of a grid."""
     freeze_seconds: float | None = None
     """When there was an occupancy."""
     at_freezing: dict[str, Any] | None = None
-    """What it cost and saved then, `PRICES` of its report: a host may skip less later on."""
+    """`PRICES` of its report then: a host may skip less later on."""
     recoveries: int | None = None
-    """How often a collapsed gate was healed; None where a model learns none itself."""
+    """How often a collapsed gate was healed, if it learned one."""
     warming_up: bool | None = None
-    """Whether the run ended in the warm-up of an occupancy grid, in which all cells are asked."""
+    """Whether the run ended in the warm-up of a grid, in which all cells are asked."""
     psnr: float = math.nan
-    """Of the pixels of all test images together, as the last point of the curve."""
+    """Of the pixels of all test images together."""
     image_psnr: float | None = None
-    """Mean over test images of the PSNR of each, as ns-eval averages it, on the same pixels."""
+    """Mean over test images of the PSNR of each on the same pixels."""
     ssim: float = math.nan
     flip: float | None = None
     lpips: float | None = None
@@ -85,8 +85,7 @@ class TimedRun:
     """In all of the training."""
     render_seconds_per_image: float = 0.0
     peak_memory_bytes: int | None = 0
-    """Of the allocator on CUDA, of the process elsewhere; None where it may be that of other
-    work."""
+    """Of the allocator on CUDA, of the process elsewhere."""
     peak_process_bytes: int | None = 0
     peak_allocator_bytes: int | None = None
     curve: list[tuple[float, float]] = field(default_factory=list)
@@ -115,13 +114,11 @@ def timed_run(
 ) -> tuple[TimedRun, Trainer]:
     """Trains until the budget is used and evaluates on the test images.
 
-    The learning rates of all groups decay to a tenth over the budget, whatever the number of steps;
-    nerfstudio's own schedulers count steps, and a slow method would end with a high rate. A host
-    that learns its occupancy first has the full rates at its own first step, as in `ns-train`.
+    The learning rates of all groups decay to a tenth over the budget, whatever the number of steps.
+    A host that learns its occupancy first has the full rates at its own first step.
 
     Args:
         config: a method with its data; it is copied, not changed.
-        budget: when the run is over.
         sampler: what to call the sampler in the record.
         curve_points: evaluations, evenly spaced over the budget, the last at its end; 0 leaves
             the PSNR to the caller.
@@ -319,10 +316,7 @@ def render_rays(model: Any, bundle: Any, at_once: int) -> Tensor:
 
 @torch.no_grad()
 def errors_on_rays(trainer: Trainer, rays: int) -> list[float]:
-    """Mean squared error of each test image on its share of `rays` pixels, the same at every call.
-
-    A full image of an unguided method takes minutes on a CPU; some thousand pixels say as much.
-    """
+    """Mean squared error of each test image on its share of `rays` pixels, always the same."""
     pipeline = trainer.pipeline
     pipeline.eval()
     dataset: Any = pipeline.datamanager.eval_dataset
@@ -347,15 +341,9 @@ def errors_on_rays(trainer: Trainer, rays: int) -> list[float]:
 
 @torch.no_grad()
 def evaluate_images(trainer: Trainer, most_images: int, queries: Counter[str]) -> dict[str, float]:
-    """Figures over whole test images, evenly chosen; rendering alone is timed.
-
-    The model has rendered before, so that nothing is built on the way.
-
-    Returns:
-        Means of `psnr`, `ssim`, `flip` and `lpips` (as `image_metrics` has them),
-        `samples_per_ray`, `field_queries_per_ray`, `proposal_queries_per_ray`,
-        `gate_queries_per_ray`; the median of `render_seconds_per_image`.
-    """
+    """Means of figures of whole test images, evenly chosen, as `image_metrics` has them; samples
+    and queries a ray; median `render_seconds_per_image`. The model has rendered before, so that
+    nothing is built on the way."""
     pipeline = trainer.pipeline
     pipeline.eval()
     dataset: Any = pipeline.datamanager.eval_dataset

@@ -22,24 +22,20 @@ class Case:
     name: str
     """A stage of the same name is what is there; else it is the yard."""
     title: str
-    """In the table."""
     why: str
     """What it is for, in a sentence."""
     capture: Capture = field(default_factory=Capture)
-    """How it is photographed."""
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the model; those of the occupancy count for what learns one."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of the whole method."""
     grid_levels: int = 1
     """Nested boxes of occupancy grids: as many as somebody who knows the scene would take."""
     fine_grid: bool = False
-    """Whether the size of cells is the question, so that 256^3 are tried too. To keep these up to
-    date takes a core of a CPU minutes."""
+    """Whether the size of cells is the question, so that 256^3 are tried too, for minutes of a
+    core."""
     only: tuple[str, ...] = ()
-    """Samplers that it has something to say about; none is all. References join by themselves."""
+    """Samplers that it has something to say about, besides references; none is all."""
     seeds: int = 1
-    """Fewest seeds."""
     must_fail: bool = False
     """Whether it shows that the suite can tell a failure: learned occupancy has to fail in it."""
 

@@ -1,10 +1,7 @@
 """The scenes of the cases, photographed and written in nerfstudio's format, with the truth.
 
-All but the far ones lie within four metres of the middle. Whatever stands in them is grey; only the
-sky is blue. A host learns shapes and lightness early and hue late, in some seeds hundreds of steps
-later than in others, which says nothing about where it samples.
-
-What goes wrong touches the training pictures only: the held-out ones show what is really there.
+All but the far ones lie within four metres of the middle. Whatever stands in them is grey, for a
+host learns hue late; only the sky is blue. What goes wrong touches the training pictures only.
 truth/NAME.npz holds, for each held-out picture, `depth` [h, w] in metres along the rays (inf for no
 surface), `detail` [h, w], the pixels in which something is seen that the case is about, and
 `shown_by` [h, w], how many training pictures show the same surface.
@@ -122,8 +119,7 @@ RADIUS = 5.0
 STRAY_RADIUS = 9.0
 """Of a camera that stands far off, metres."""
 SAME_PLACE = 0.05
-"""Share of the distance by which a surface in another picture may be off: pixels are wide at the
-size of these pictures."""
+"""Share of the distance by which a surface in another picture may be off."""
 DESCRIPTION, TRUTH = "stability.json", "truth"
 POINTS_PER_VIEW = 60
 
@@ -133,10 +129,8 @@ class Capture:
     """How a scene is photographed: two captures that are equal give the same pictures."""
 
     views: int = 48
-    """Training pictures: so many, so wide and from so far that three of them show nearly all that
-    the held-out ones show. From 40 narrow ones nearer by, a wall was placed by chance."""
+    """Training pictures: three of them show nearly all that the held-out ones show."""
     test_views: int = 16
-    """Held-out pictures."""
     width: int = 64
     height: int = 48
     """Of a picture, pixels."""
@@ -262,10 +256,7 @@ class View(NamedTuple):
 
 
 def count_views(view: View, others: Sequence[View]) -> NDArray[np.int32]:
-    """[h, w] how many of the other pictures show what a picture shows; 0 where it shows nothing.
-
-    A surface in one picture alone has no depth that could be learned: whether it is kept is chance.
-    """
+    """[h, w] how many others show what a picture shows. In one alone, a surface has no depth."""
     counts = np.zeros(view.depth.shape, dtype=np.int32)
     there = np.isfinite(view.depth)
     points = view.lens.points(view.pose, view.depth)[there]
@@ -275,8 +266,8 @@ def count_views(view: View, others: Sequence[View]) -> NDArray[np.int32]:
 
 
 def write_scene(stage: Stage, capture: Capture, folder: Path) -> Path:
-    """Writes the scene, unless `folder`, which is returned, holds just this one; it appears only
-    when it is complete. A folder that holds no scene of ours is an `InputError`."""
+    """Writes the scene, whole, unless `folder`, which is returned, holds just this one; an
+    `InputError` where it holds no scene of ours."""
     description = folder / DESCRIPTION
     described = {"digest": digest_of(stage, capture), "capture": asdict(capture)}
     text = json.dumps(described, indent=1) + "\n"
@@ -297,7 +288,6 @@ def write_scene(stage: Stage, capture: Capture, folder: Path) -> Path:
 
 
 def digest_of(stage: Stage, capture: Capture) -> str:
-    """The same for the same pictures."""
     return hashlib.sha256(repr((stage, capture)).encode()).hexdigest()[:16]
 
 
@@ -347,7 +337,6 @@ def _take_pictures(stage: Stage, capture: Capture, folder: Path) -> None:
 
 
 def _frame(shot: Shot, lens: Lens) -> dict[str, Any]:
-    """A picture in transforms.json."""
     matrix = [*shot.written.tolist(), [0.0, 0.0, 0.0, 1.0]]
     size = {"w": lens.width, "h": lens.height, "cx": lens.width / 2, "cy": lens.height / 2}
     focal = {"fl_x": lens.focal, "fl_y": lens.focal}

@@ -1,8 +1,7 @@
 """Which samplers are compared, each in a host; which runs a table needs; and how long they take.
 
-The sizes, rays and steps are the same for all samplers. A sampler is held against the dense
-reference of its own host: Instant-NGP for those that ask "is this place occupied?", Nerfacto for
-proposal networks.
+All have the same sizes, rays and steps. A sampler is held against the dense reference of its own
+host: Instant-NGP, or Nerfacto for proposal networks.
 """
 
 from __future__ import annotations
@@ -53,8 +52,7 @@ class Sizes:
     """Binary logarithm of the entries of the hosts' hash tables."""
 
     def host(self, in_nerfacto: bool) -> dict[str, Any]:
-        """Nerfacto, or Instant-NGP with steps that grow with the distance: rays end well beyond the
-        scene."""
+        """Nerfacto, or Instant-NGP with steps that grow with the distance."""
         sizes = {"host.log2_hashmap_size": self.table, "host.max_res": 512, "host.far_plane": 20.0}
         if in_nerfacto:
             return {**sizes, "host.use_appearance_embedding": False}
@@ -74,7 +72,6 @@ class Sampler:
     """One column of the table."""
 
     name: str
-    """On the command line."""
     title: str
     """In the table."""
     reference: str | None
@@ -94,8 +91,7 @@ SAMPLERS = {
 
 
 def samplers_named(names: tuple[str, ...]) -> list[Sampler]:
-    """The samplers of these names and the references they are held against, in the table's order;
-    an `InputError` for a name that there is not."""
+    """Samplers of these names and their references; an `InputError` for an unknown name."""
     unknown = [name for name in names if name not in SAMPLERS]
     if unknown:
         raise InputError(f"there is no sampler {unknown[0]!r}; there are {', '.join(SAMPLERS)}")
@@ -115,10 +111,8 @@ def contender_of(
     settings: Mapping[str, Any],
     grid_levels: int = 1,
 ) -> Contender:
-    """The sampler in its host under the conditions of a case.
-
-    Changes of the model that are about learning are left out where nothing is learned.
-    """
+    """The sampler in its host under the conditions of a case, some of which are about learning
+    only."""
     name = sampler.name
     in_nerfacto = name in (PROPOSALS, DENSE_PROPOSAL)
     own: dict[str, Any] = {"occupancy.sampler": name}
@@ -161,7 +155,6 @@ class Run(NamedTuple):
 
     @property
     def key(self) -> Key:
-        """The same for what is run once however many cells share it."""
         return self.scene, self.job.name
 
 
@@ -190,10 +183,7 @@ def entries_of(
 
     Args:
         seeds: of each cell. Learned occupancy has more where a case is about seeds.
-        beside: seeds of the samplers that learned occupancy is compared with, some of `seeds`; none
-            is `seeds`.
-    Raises:
-        InputError: a seed beside is none of `seeds`, so that nothing has it to be compared with.
+        beside: those of `seeds` that other samplers have; none is all. Others are an `InputError`.
     """
     if alone := [seed for seed in dict.fromkeys(beside) if seed not in seeds]:
         raise InputError(f"--seeds-beside {alone[0]} is none of --seeds: add it there")
@@ -227,7 +217,6 @@ def scenes_of(cases: Sequence[Case], sizes: Sizes) -> dict[str, tuple[Stage, Cap
 
 
 def capture_of(case: Case, sizes: Sizes) -> Capture:
-    """A case's capture in pictures of the suite's size."""
     capture = case.capture
     views = capture.views
     if views == Capture.views:
@@ -242,8 +231,7 @@ def capture_of(case: Case, sizes: Sizes) -> Capture:
 
 
 def core_seconds(runs: Sequence[Run], stored: Sequence[Mapping[str, Any]]) -> float:
-    """What runs to be made take of one core, seconds: as long as stored ones of their samplers,
-    else as the longest of any."""
+    """Seconds of one core: as stored runs of their samplers, else as the longest of any."""
     measured: defaultdict[str, list[float]] = defaultdict(list)
     for record in stored:
         measured[record["sampler"]].append(float(record["processor_seconds"]))

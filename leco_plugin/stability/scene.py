@@ -1,7 +1,6 @@
 """Small scenes and what is seen in them: exact colours and depths along any ray.
 
-Rays meet surfaces in closed form. Fog is integrated in fine steps, and glass is laid over what is
-behind it, so that both are as exact as a picture of eight bits can show. Positions are in metres,
+Fog is integrated in fine steps, and glass is laid over what is behind it. Positions are in metres,
 +z up. A ray that begins inside a shape meets it from within: a box around the camera is a room.
 """
 
@@ -22,7 +21,7 @@ _SUN = np.array([0.48, -0.36, 0.8])
 _SHADE = 0.45
 """Light where the sun does not reach."""
 _QUINCUNX = ((0.5, 0.5), (0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75))
-"""Places in a pixel that rays go through. The first gives the depth, all give the colour."""
+"""Places in a pixel that rays go through; the first gives the depth."""
 _FOG_STEPS = 32
 _HORIZON, _ZENITH = np.array([0.86, 0.90, 0.94]), np.array([0.35, 0.55, 0.86])
 
@@ -62,8 +61,8 @@ class Box:
         return np.minimum(*sides).max(1), np.maximum(*sides).min(1)
 
     def meet(self, origins: Array, directions: Array) -> tuple[Array, Array]:
-        """Where rays [N, 3] first meet the surface: distances [N], metres along unit directions,
-        inf for none; and outward normals [N, 3]."""
+        """Distances [N], metres, inf for none, at which rays first meet it, and outward normals [N,
+        3]."""
         low, high = np.array(self.low), np.array(self.high)
         enters, leaves = self.span(origins, directions)
         t = np.where(enters > _TINY, enters, leaves)

@@ -56,7 +56,6 @@ SIZES = "sizes.json"
 """File whose presence says that a folder is a table's, with the sizes of all runs there."""
 DAMAGED = "is damaged, or not of a table; delete it, or name a new folder with --out"
 SCENES, FAILURES = "scenes", "failures"
-"""Folders of the table."""
 PER_PORTION = {"cores", "threads"}
 """Facts of the machine that say how many runs are made at once, and change no run."""
 OF_OCCUPANCY = (
@@ -105,14 +104,10 @@ def make_table(
 
 
 class Suite:
-    """One table: its scenes, its runs, and its results so far.
+    """One table: its scenes, its runs, and its results so far, in the folder `out`.
 
-    Args:
-        out: its folder; `scenes` holds what is photographed, `runs` what was run, by scene.
-        cases, samplers, seeds, sizes, beside: as of `entries_of`.
-    Raises:
-        ValueError, OSError: nothing to run, no seed, or a folder of something else, of other sizes
-            or versions.
+    Other arguments are as of `entries_of`. `ValueError` or `OSError` where there is nothing to run,
+    or the folder is of something else, of other sizes or versions.
     """
 
     def __init__(
@@ -152,13 +147,11 @@ class Suite:
             self.folders[name] = RunFolder(out / RUNS / name, settings | {"sizes": asdict(sizes)})
 
     def runner(self, scene: str) -> Runner:
-        """What makes the runs of a scene, in processes with one thread each."""
         threads = 1 if self.workers > 1 else None
         place = self.data[scene], self.protocol, self.folders[scene]
         return ProcessRunner(*place, WORKER, threads, self.stop)
 
     def stored(self) -> dict[Key, dict[str, Any]]:
-        """Records of finished runs."""
         return {
             (scene, name): record["run"]
             for scene, folder in self.folders.items()
@@ -191,8 +184,8 @@ class Suite:
     def make(self, say: Say, show: Callable[[float], None], seconds: float = math.inf) -> None:
         """Makes what is missing; whenever this is stopped, what was finished is kept.
 
-        After so many seconds no run is to go on: but for the first ones, what would take longer is
-        left for another time. `say` and `show` are as of `make_jobs`.
+        But for the first runs, one that would go on after so many seconds is left for another time.
+        `say` and `show` are as of `make_jobs`.
         """
         todo, ends = self.missing(), time.monotonic() + seconds
 
@@ -261,7 +254,6 @@ class Suite:
         return {**cell.to_dict(), "runs": [_figures(run, names[run["seed"]]) for run in runs]}
 
     def reference_of(self, entry: Entry) -> Entry:
-        """The cell that a cell is held against."""
         of_case = {other.sampler.name: other for other in self.entries if other.case is entry.case}
         return of_case[entry.sampler.reference or entry.sampler.name]
 
@@ -309,7 +301,7 @@ class Suite:
 
 
 def _figures(run: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """Of a run, what a verdict needs, and what says where it comes from."""
+    """What a verdict needs of a run, and what says where it comes from."""
     kept = {key: run[key] for key in ("seed", "psnr", "processor_seconds", "measured", "made")}
     if facts := run.get("occupancy"):
         kept["occupancy"] = {key: facts.get(key) for key in OF_OCCUPANCY}

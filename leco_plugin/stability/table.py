@@ -25,7 +25,7 @@ SIGNS = {"pass": "pass", "degraded": "degraded", "fail": "**fail**", "no referen
 ROW, HEAD, FOOT = 0.34, 1.15, 0.75
 """Heights in inches."""
 NAMES, COLUMN = 2.45, 1.88
-"""Widths in inches: type of 10 points is to be read where a page shows all of it."""
+"""Widths in inches."""
 GAP = 0.03
 VIEW = 3.4
 """Width of one picture of a failure, inches."""
@@ -37,14 +37,12 @@ HOW_TO_READ = (
     "- nothing to compare with: the dense run does not train"
 )
 LOST = 0.005
-"""Share of the surfaces that is said in a picture."""
 ON_LIGHT = {
     "pass": ("#d7f0df", "#0f5a2f"),
     "degraded": ("#fbeab8", "#6b4c00"),
     "fail": ("#f6c9c4", "#8c1d13"),
     "no reference": ("#eceef1", "#656c76"),
 }
-"""The ground of a cell, and the ink on it."""
 ON_DARK = {
     "pass": ("#12351f", "#86dfa6"),
     "degraded": ("#443408", "#f2d06b"),
@@ -94,7 +92,6 @@ def headline(results: Results) -> str:
 
 
 def titles(results: Results) -> tuple[str, str]:
-    """The headline in two lines, each with a capital at its beginning."""
     title, _, below = headline(results).partition("; ")
     return title[:1].upper() + title[1:], below[:1].upper() + below[1:]
 
@@ -123,8 +120,7 @@ def _count_passes(results: Results) -> str:
 
 
 def verdicts_of(results: Results, sampler: str) -> list[str]:
-    """Verdicts of a sampler on all cases but those that must fail; where cells are made of the same
-    runs, one verdict for all of them."""
+    """Verdicts of a sampler on cases that need not fail; one for all cells of the same runs."""
     found: dict[Any, str] = {}
     for row in results["cases"]:
         if not row["must_fail"] and sampler in row["cells"]:
@@ -135,8 +131,7 @@ def verdicts_of(results: Results, sampler: str) -> list[str]:
 
 
 def blind(results: Results) -> list[str]:
-    """Why the suite cannot be believed, in a line each: cases that must fail, and have been run
-    without failing for what is measured of them."""
+    """Why the suite cannot be believed: cases that must fail, and did not by their figures."""
     said = []
     for row in results["cases"]:
         cell = row["cells"].get(LEARNED)
@@ -150,7 +145,6 @@ def blind(results: Results) -> list[str]:
 
 
 def is_unproven(results: Results) -> bool:
-    """Whether a case that must fail has not failed: nobody knows then what this table notices."""
     cells = [row["cells"].get(LEARNED, {}) for row in results["cases"] if row["must_fail"]]
     return bool(blind(results)) or any(cell.get("verdict") != "fail" for cell in cells)
 
@@ -232,7 +226,6 @@ def _draw_cell(
 
 
 def _wrong(cell: Mapping[str, Any]) -> str:
-    """What a cell that does not pass suffers from, in two words."""
     if cell["psnr"] is None or cell["verdict"] in ("pass", "no reference"):
         return ""
     if cell["gap"] is not None and (cell["lost_mass"] or 0.0) >= LOST:

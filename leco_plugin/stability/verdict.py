@@ -1,7 +1,7 @@
 """Pass, degraded or fail: what the runs of a sampler in a case say beside those of its reference.
 
-A sampler is held to what its own host reaches when nothing is skipped, with as many steps of as
-many rays. Where that does not train, nothing is held to anything.
+A sampler is held to what its own host reaches when nothing is skipped, in as many steps of as many
+rays. Where that does not train, nothing is held to anything.
 """
 
 from __future__ import annotations
@@ -27,8 +27,7 @@ class Bars:
     detail: float
     """As `below_reference`, on the pixels that the case is about."""
     lost_mass: float
-    """Share of the rays whose surface is not sampled, above the reference's. No occupancy is exact
-    to a pixel at the edges of things."""
+    """Share of rays whose surface is not sampled, above the reference's."""
 
 
 PASS, DEGRADED = Bars(0.2, 0.5, 0.5, 0.01), Bars(1.0, 1.5, 2.0, 0.05)
@@ -40,8 +39,6 @@ GOOD_ANYWAY = 30.0
 
 @dataclass(frozen=True)
 class Cell:
-    """One cell of the table."""
-
     verdict: Verdict
     reason: str
     """In a few words; empty for a pass."""
@@ -76,8 +73,7 @@ def judge(
     """The cell of a sampler in a case, by its finished runs.
 
     Args:
-        reference: runs of its dense reference, of which the same seeds count; None where it is one
-            itself.
+        reference: runs of its dense reference; None where it is one itself.
         failures: reasons of its runs that have ended without a result.
         missing: number of its runs that have not been made.
     """
@@ -117,8 +113,8 @@ def _of_the_same_seeds(some: Runs, others: Runs) -> Runs:
 
 
 def _broken(cell: Cell, bars: Bars, lost: float) -> str:
-    """The first bar that a cell is on the wrong side of, in words; `lost` is the share of surfaces
-    beyond the reference's."""
+    """The first bar that a cell breaks, in words; `lost` is the share of surfaces beyond the
+    reference's."""
     if cell.gap is not None and cell.gap < -bars.below_reference:
         return f"{-cell.gap:.2f} dB below dense"
     if cell.detail_gap is not None and cell.detail_gap < -bars.detail:
@@ -131,7 +127,7 @@ def _broken(cell: Cell, bars: Bars, lost: float) -> str:
 
 
 def _unmeasured(runs: Runs, reference: Runs) -> str:
-    """The first figure that is missing or no number, in words: what was not seen is not passed."""
+    """The first figure that is missing or no number, in words."""
     wanted = ["kept_fraction", "trivial_psnr"]
     wanted += [name for name in ("lost_mass", "detail_psnr") if _values(reference, name)]
     for run in runs:

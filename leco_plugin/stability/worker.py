@@ -37,16 +37,14 @@ from leco_plugin.stability.plan import DENSE_LEVELS
 from leco_plugin.studio.host_models import true_colours
 
 NEAR = 0.03
-"""A sample whose middle is within this share of the surface's distance is near it: the references
-step by about as much."""
+"""A sample whose middle is within this share of the surface's distance is near it."""
 RASTER = 3
-"""Of the pixels of a held-out picture, one in so many is looked at, along diagonals. Half of the
-error lies on silhouettes, so that parts of many pictures say more than few whole ones: seeds of
-learned occupancy differ by 0.36 dB in four pictures and by 0.24 in sixteen."""
+"""One pixel in so many is looked at, along diagonals: parts of many pictures say more than few
+whole ones."""
 FEWEST_VIEWS = 2
 """Training pictures that show a surface for it to count: one alone does not tell its depth."""
 RAYS_AT_ONCE = 256
-"""Few: on a CPU one of 1024 took two to four times as long as one of 342, most of it for memory."""
+"""Few: on a CPU 1024 took two to four times as long as 342."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +54,7 @@ class Measured:
     psnr: float
     """Of all that is looked at."""
     lost_mass: float | None
-    """Of the rays that meet a surface which `FEWEST_VIEWS` show, the share without a sample near
-    it; None without such surfaces."""
+    """Share of rays without a sample near a surface that `FEWEST_VIEWS` show; None without such."""
     kept_fraction: float
     """Samples as a share of the candidates of the dense reference."""
     detail_psnr: float | None
@@ -105,11 +102,8 @@ def with_fixed_batches(config: TrainerConfig) -> TrainerConfig:
 def measure(
     pipeline: Pipeline, data: Path, dense_samples: int
 ) -> tuple[Measured, NDArray[np.uint8]]:
-    """Looks at the held-out pictures of a case's scene, and renders what of them it needs.
+    """Looks at the held-out pictures of a case's scene, in the folder `data` with its truth.
 
-    Args:
-        data: folder of the scene, with its truth.
-        dense_samples: candidates of a ray of a proposal host's reference.
     Returns:
         The figures, and the first picture [h, w, 3] as the host renders it.
     """
@@ -162,13 +156,9 @@ def raster(height: int, width: int) -> Tensor:
 
 
 def count_lost(nearest: Tensor, depth: Tensor, shown_by: Tensor) -> tuple[int, int]:
-    """How many rays lose the surface that they meet, and how many meet one that counts.
-
-    Args:
-        nearest: [N] distance of the surface from the middle of the nearest sample.
-        depth: [N] distance of the surface, in the same units.
-        shown_by: [N] training pictures that show it; 0 where there is none.
-    """
+    """How many rays lose the surface that they meet, and how many meet one that counts: of [N]
+    distances of it from the nearest sample, and from the camera, and the training pictures that
+    show it."""
     counts = shown_by >= FEWEST_VIEWS
     kept = nearest[counts] <= NEAR * depth[counts]  # not where a sample is nowhere
     return int((~kept).sum()), int(counts.sum())
@@ -188,8 +178,8 @@ def find_samples(
         depth: [N] distance of each ray's surface, scene units; inf for none.
         dense_samples: candidates of a ray of a proposal host's reference.
     Returns:
-        [N] distance of the surface from the middle of the nearest sample, inf without one; number
-        of samples; and number of candidates of the dense reference.
+        [N] distance of the surface from the middle of the nearest sample, inf without one; numbers
+        of samples, and of candidates of the dense reference.
     """
     is_packed = not hasattr(model, "proposal_sampler")
     sample = _sample_packed if is_packed else partial(_sample_proposals, dense_samples)

@@ -8,13 +8,13 @@ from typing import Any
 import pytest
 
 from leco_plugin.capacity.choice import (
+    TOLD_APART,
     WORTH_TEN_TIMES,
     best_gate,
     choose,
     circumstances,
     common_volume,
     draw,
-    grid_that_nearly_suffices,
     grid_that_suffices,
     kilobytes,
     smallest_grid,
@@ -87,11 +87,10 @@ def test_a_usual_grid_that_keeps_as_little_as_a_smaller_gate_suffices() -> None:
 def test_a_grid_that_keeps_hardly_more_is_not_called_worse() -> None:
     """One field and one seed do not tell them apart."""
     hardly, more = (row("grid", "32", 4_096, factor * 0.062) for factor in (1.15, 1.25))
-    assert grid_that_nearly_suffices([SMALL_GATE, hardly]) is hardly
+    assert grid_that_suffices([SMALL_GATE, hardly], TOLD_APART) is hardly
     assert "4.1 kB, keeps 7.1%: with one field" in verdict([SMALL_GATE, hardly])
-    assert grid_that_nearly_suffices([SMALL_GATE, more]) is None
-    assert grid_that_nearly_suffices([SMALL_GATE, FINE]) is None  # no usual one
-    assert grid_that_nearly_suffices([SMALL_GATE, row("grid", "64", 32_768, 0.06)]) is None
+    assert grid_that_suffices([SMALL_GATE, more], TOLD_APART) is None
+    assert grid_that_suffices([SMALL_GATE, FINE], TOLD_APART) is None  # no usual one
 
 
 def test_grids_that_never_keep_as_little_are_named() -> None:
