@@ -12,8 +12,8 @@ from chart_sections import stored
 from page_parts import RESULTS, between, noted, table
 from walk import with_walk
 
-from leco_plugin.chart.summary import Line, compare, lines_of, seeds_said
-from leco_plugin.evaluation.report import cores_said
+from leco_plugin.chart.summary import Line, compare, describe_seeds, lines_of
+from leco_plugin.evaluation.report import describe_cores
 
 DEMO = "<!-- demo: generated -->", "<!-- end of the demo -->"
 GAIN = "<!-- gain: generated -->", "<!-- end of the gain -->"
@@ -133,7 +133,8 @@ def gain_table(results: Mapping[str, Any], short: bool = False) -> str:
     numbers."""
     lines = lines_of(results)
     seconds, scene = results["protocol"]["seconds"], results["scene"]["name"]
-    head = f"`{scene}`, {seconds:g} s on {cores_said(results['machine'])}, {seeds_said(results)}"
+    cores, seeds = describe_cores(results["machine"]), describe_seeds(results)
+    head = f"`{scene}`, {seconds:g} s on {cores}, {seeds}"
     rows = [
         [
             f"**{line.name}**" if line.learned else line.name,

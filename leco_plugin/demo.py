@@ -23,7 +23,7 @@ from leco_plugin.evaluation.clock import Budget, forget_peaks
 from leco_plugin.evaluation.equal_loss import occupancy_facts, truth_of
 from leco_plugin.evaluation.inspection import ViewBox
 from leco_plugin.evaluation.occupancy_picture import draw_slice
-from leco_plugin.evaluation.report import cores_said, describe_code, describe_machine
+from leco_plugin.evaluation.report import describe_code, describe_cores, describe_machine
 from leco_plugin.evaluation.timed_run import TimedRun, timed_run
 from leco_plugin.learning.freezing import FILE_NAME
 from leco_plugin.log import bar
@@ -132,7 +132,7 @@ def _scene_facts(city: CityConfig, capture: CaptureConfig, manager: Any) -> dict
 def draw_chart(report: dict[str, Any], path: Path) -> Path:
     """Draws the demo's chart from its report: PSNR against seconds of training of both runs."""
     runs, blocks, machine = report["runs"], report["scene"]["blocks"], report["machine"]
-    where = cores_said(machine) if machine["device"] == "cpu" else "one GPU"
+    where = describe_cores(machine) if machine["device"] == "cpu" else "one GPU"
     gain = runs[0]["psnr"] - runs[1]["psnr"]
     title = f"{gain:+.1f} dB after the same time, by skipping what is empty"
     names = ("skips what it has\nlearned is empty", "the same model,\nskipping nothing")

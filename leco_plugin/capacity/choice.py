@@ -20,7 +20,7 @@ from leco_plugin.chart.theme import (
     style,
     themed,
 )
-from leco_plugin.evaluation.report import cores_said
+from leco_plugin.evaluation.report import describe_cores
 
 Row = Mapping[str, Any]
 """What was measured of a representation."""
@@ -205,7 +205,7 @@ def circumstances(results: Mapping[str, Any]) -> str:
     machine, scene = results["machine"], results["scene"]
     full = [row["size"] for row in results["representations"] if _keeps_all(row)]
     left_out = f" (not drawn, as they keep all: {', '.join(full)})" if full else ""
-    where = cores_said(machine) if machine["device"] == "cpu" else machine["device"]
+    where = describe_cores(machine) if machine["device"] == "cpu" else machine["device"]
     return (
         f"{scene['name']}, {scene['train_images']} photographs; one field of "
         f"{results['learn_steps']} steps teaches all; {results['rays']} held-out rays; {where}. "

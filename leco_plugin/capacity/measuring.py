@@ -163,13 +163,18 @@ def lost_where(worth: Tensor, scores: Tensor, of_volume: Tensor, share: float) -
     return float(lost / worth.double().sum())
 
 
-def measure_gate(taught: Taught, candidate: Candidate, lost: float) -> dict[str, Any]:
-    """Teaches a gate and measures it, as it would be stored and asked."""
-    assert candidate.gate is not None
+def measure_candidate(taught: Taught, candidate: Candidate, lost: float) -> dict[str, Any]:
+    """Teaches a gate or a grid and measures it, as it would be stored and asked."""
     started = seconds_now()
-    score = taught_score(candidate.gate, taught.lesson, taught.mixture.precision)
-    scores, of_volume = in_parts(score, taught.mapped), in_parts(score, taught.volume)
-    return _row(candidate, started, measure(taught.held_out, scores, of_volume, lost))
+    if candidate.gate is None:
+        found = _measure_grid(taught, candidate, lost)
+    else:
+        score = taught_score(candidate.gate, taught.lesson, taught.mixture.precision)
+        scores, of_volume = in_parts(score, taught.mapped), in_parts(score, taught.volume)
+        found = measure(taught.held_out, scores, of_volume, lost)
+    seconds = round(seconds_now() - started, 2)
+    named = {"family": candidate.family, "size": candidate.size, "bytes": candidate.bytes}
+    return {**named, "seconds": seconds, **found}
 
 
 def taught_score(
@@ -186,10 +191,10 @@ def taught_score(
     return score
 
 
-def measure_grid(taught: Taught, candidate: Candidate, lost: float) -> dict[str, Any]:
-    """Teaches a grid and measures it, dilated by a cell where it keeps less so."""
+def _measure_grid(taught: Taught, candidate: Candidate, lost: float) -> dict[str, Any]:
+    """Dilated by a cell where it keeps less so."""
     assert candidate.resolution is not None
-    started, box = seconds_now(), mapped_box(taught.mixture)
+    box = mapped_box(taught.mixture)
     scores = taught_grid(taught.lesson, box, candidate.resolution)
     both = []
     for cells in (scores, dilate(scores)):
@@ -199,19 +204,13 @@ def measure_grid(taught: Taught, candidate: Candidate, lost: float) -> dict[str,
         kept = cells >= threshold_losing(taught.held_out.worth, of_rays, lost)
         found = measure(taught.held_out, of_rays, of_volume, lost)
         both.append(found | {"octree_bytes": octree_bytes(kept)})
-    return _row(candidate, started, min(both, key=lambda one: one["kept_volume"]))
+    return min(both, key=lambda one: one["kept_volume"])
 
 
 def taught_grid(lesson: Lesson, box: ViewBox, cells: int) -> Tensor:
     """Scores [n, n, n] of a grid: a cell has the largest target of the lesson in it."""
     scores = torch.zeros((cells,) * 3, device=lesson.mapped.device)
     return largest_in_cells(scores, box, lesson.mapped, 1.0 - lesson.skip)
-
-
-def _row(candidate: Candidate, started: float, found: dict[str, Any]) -> dict[str, Any]:
-    seconds = round(seconds_now() - started, 2)
-    named = {"family": candidate.family, "size": candidate.size, "bytes": candidate.bytes}
-    return {**named, "seconds": seconds, **found}
 
 
 POINTS = "points"
@@ -289,8 +288,8 @@ def _measure_missing(
     todo = [one for one in candidates if one.key not in rows]
 
     def measure_one(candidate: Candidate, show: Callable[[float], None]) -> str:
-        measured = measure_grid if candidate.gate is None else measure_gate
-        row = rows[candidate.key] = measured(taught, candidate, lost_surface_mass) | made_by(code)
+        row = measure_candidate(taught, candidate, lost_surface_mass) | made_by(code)
+        rows[candidate.key] = row
         write_json(out / POINTS / f"{candidate.key}.json", row)
         return line_of(row)
 

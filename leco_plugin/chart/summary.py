@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from leco_plugin.chart.contender import Protocol, shared_method, short_names
-from leco_plugin.evaluation.report import cores_said
+from leco_plugin.evaluation.report import describe_cores
 
 CONFIDENCE = 0.95
 """Of the interval around a difference of means; of each comparison alone, however many are made."""
@@ -298,11 +298,11 @@ def circumstances(results: Mapping[str, Any]) -> str:
     machine, protocol = results["machine"], results["protocol"]
     where, at_once = str(machine["device"]), protocol.get("at_once", 1)
     if where == "cpu":
-        where = cores_said(machine) + (" a run" if at_once > 1 else "")
+        where = describe_cores(machine) + (" a run" if at_once > 1 else "")
     elif at_once > 1:
         where += f", {at_once} runs at a time"
     length = Protocol(protocol["seconds"], protocol["steps"]).describe()
-    many = seeds_said(results)
+    many = describe_seeds(results)
     if any(len(line.runs) > 1 for line in lines_of(results)):
         many += ": means of PSNR, medians of costs"
     method = shared_method(list(dict.fromkeys(run["name"] for run in results["runs"])))
@@ -312,7 +312,7 @@ def circumstances(results: Mapping[str, Any]) -> str:
     return said if tested is None else f"{said}, tested on a whole stretch of {len(tested)} cameras"
 
 
-def seeds_said(results: Mapping[str, Any]) -> str:
+def describe_seeds(results: Mapping[str, Any]) -> str:
     """Seeds of a contender, and how many runs failed, as "2 to 5 seeds; 3 runs failed"."""
     counts = [len(line.runs) for line in lines_of(results)]
     least, most = min(counts), max(counts)

@@ -225,10 +225,10 @@ def reached_volume(mixture: Mixture, taught: Tensor, count: int, seed: int = 0) 
     rays."""
     positions = whole_box(mixture.occupancy()).draw(count, seed).to(mixture.device)
     mapped = mixture.region.space.map(positions).clamp(-1.0, 1.0)
-    return mapped[reached(taught, mapped)]
+    return mapped[is_reached(taught, mapped)]
 
 
-def reached(taught: Tensor, mapped: Tensor) -> Tensor:
+def is_reached(taught: Tensor, mapped: Tensor) -> Tensor:
     """Which mapped positions [P, 3] share a cell with one of `taught` [M, 3]: bool [P]."""
 
     def cells(places: Tensor) -> Tensor:

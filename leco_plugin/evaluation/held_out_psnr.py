@@ -99,8 +99,8 @@ class HeldOutPsnr:
         """PSNR of rendered rays, by chunks with true colours [R, 3 or 4]; notes that of their
         mean."""
         device = self.model.device
-        cards = [device] if torch.device(device).type == "cuda" else []
-        with torch.random.fork_rng(cards), evaluating(self.model):
+        devices = [device] if torch.device(device).type == "cuda" else []
+        with torch.random.fork_rng(devices), evaluating(self.model):
             rgb = torch.cat(
                 [self.model(rays.to(device))["rgb"][:, :3].float() for rays, _ in pixels]
             )

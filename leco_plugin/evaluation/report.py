@@ -52,7 +52,7 @@ def describe_machine() -> dict[str, Any]:
     }
 
 
-def cores_said(machine: Mapping[str, Any]) -> str:
+def describe_cores(machine: Mapping[str, Any]) -> str:
     """The CPU cores that a run used, in words: as many as its threads, if there are."""
     cores = min(machine["cores"], machine["threads"])
     return "one CPU core" if cores == 1 else f"{cores} CPU cores"

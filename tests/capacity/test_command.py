@@ -56,8 +56,7 @@ def taught(monkeypatch: pytest.MonkeyPatch) -> Taught:
     mixture = SimpleNamespace(num_images=7)
     ground = SimpleNamespace(mixture=mixture, held_out=SimpleNamespace(rays=99))
     monkeypatch.setattr(measuring, "prepare", lambda *arguments: ground)
-    monkeypatch.setattr(measuring, "measure_gate", of_gate)
-    monkeypatch.setattr(measuring, "measure_grid", of_gate)
+    monkeypatch.setattr(measuring, "measure_candidate", of_gate)
     return done
 
 

@@ -18,12 +18,12 @@ from leco_plugin.chart.summary import (
     RENDERING,
     circumstances,
     common_psnr,
+    describe_seeds,
     front,
     headline,
     lines_of,
     rivals,
     seconds_to_pass,
-    seeds_said,
 )
 from leco_plugin.chart.table import table
 
@@ -131,11 +131,11 @@ def test_seeds_are_counted_for_each_contender_and_failed_runs_beside_them(tmp_pa
         for seed in (2, 3, 4)
     ]
     fewer = results(*of("A", *[20.0] * 5), *of("B", 18.0, 19.0), failures=failures)
-    assert seeds_said(fewer) == "2 to 5 seeds; 3 runs failed"
+    assert describe_seeds(fewer) == "2 to 5 seeds; 3 runs failed"
     said = "10 s of training on 2 CPU cores, 2 to 5 seeds; 3 runs failed: means of PSNR"
     assert said in circumstances(fewer)
     assert said in table(fewer) and said in figure_text(write_page(fewer, tmp_path / "chart.html"))
-    assert seeds_said(results(run("A"), run("B", 1))) == "one seed"
+    assert describe_seeds(results(run("A"), run("B", 1))) == "one seed"
     one = results(run("A"), failures=failures[:1])
     assert circumstances(one).endswith(", one seed; 1 run failed")
 

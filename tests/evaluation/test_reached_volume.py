@@ -9,7 +9,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from leco_plugin.evaluation.equal_loss import CELLS, rays_of_photographs, reached
+from leco_plugin.evaluation.equal_loss import CELLS, is_reached, rays_of_photographs
 
 
 def slow_reached(taught: Tensor, mapped: Tensor) -> list[bool]:
@@ -27,16 +27,16 @@ def test_a_place_is_reached_where_a_taught_one_shares_its_cell(seed: int) -> Non
     generator = torch.Generator().manual_seed(seed)
     taught = 0.1 * torch.rand(300, 3, generator=generator)
     mapped = 0.1 * torch.rand(500, 3, generator=generator)
-    found = reached(taught, mapped)
+    found = is_reached(taught, mapped)
     assert found.tolist() == slow_reached(taught, mapped)
     assert 0 < int(found.sum()) < 500
 
 
 def test_faces_of_the_cube_belong_to_it() -> None:
     corners = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
-    assert reached(corners, corners).all()
-    assert not reached(corners[:1], corners[1:]).any()
-    assert reached(corners[:1], corners[:1] + 1.0 / CELLS).all()
+    assert is_reached(corners, corners).all()
+    assert not is_reached(corners[:1], corners[1:]).any()
+    assert is_reached(corners[:1], corners[:1] + 1.0 / CELLS).all()
 
 
 def photographs() -> SimpleNamespace:

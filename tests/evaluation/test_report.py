@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from leco_plugin.evaluation.report import (
-    cores_said,
     describe_code,
+    describe_cores,
     describe_machine,
     made_by,
 )
@@ -33,7 +33,7 @@ def test_the_machine_is_described_without_its_name() -> None:
 def test_a_run_has_as_many_cores_as_threads_and_no_more_than_there_are(
     cores: int, threads: int, said: str
 ) -> None:
-    assert cores_said({"cores": cores, "threads": threads}) == said
+    assert describe_cores({"cores": cores, "threads": threads}) == said
 
 
 def test_a_figure_says_what_made_it_and_when() -> None:
