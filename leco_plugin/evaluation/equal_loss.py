@@ -49,8 +49,6 @@ CELLS = 64
 """Along an axis of the mapped cube: a cell is reached if it holds a candidate of those rays."""
 MOST_ON_CPU = 2e8
 """Densities evaluated for one grid: about three minutes of two cores."""
-Resolution = int | tuple[int, int, int]
-"""Cells of a grid along all axes, or along each."""
 SPARED = 0.1
 """Share of the loss for which cells of a coarse grid are taken as empty in finer ones."""
 
@@ -82,7 +80,7 @@ def kept_shares(
 def at_equal_loss(
     mixture: Mixture,
     datamanager: Any,
-    grids: Sequence[Resolution] = (),
+    grids: Sequence[int] = (),
     others: Mapping[str, Callable[[Tensor], Tensor] | Tensor] | None = None,
     config: CalibrationConfig = CALIBRATION,
 ) -> dict[str, Any]:
@@ -154,21 +152,19 @@ def near_points(points: Tensor) -> Callable[[Tensor], Tensor]:
 def _kept_by_grid(
     weights: Tensor, box: ViewBox, mapped: Tensor, volume: Tensor, scores: Tensor
 ) -> dict[str, Any]:
-    """What a grid of scores [nx, ny, nz] keeps, as it is or dilated, and its bytes as an octree."""
+    """What a grid of scores [n, n, n] keeps, as it is or dilated, and its bytes as an octree."""
     both = []
     for dilated, cells in enumerate((scores, dilate(scores))):
         of_rays, of_volume = (look_up_scores(cells, box, places) for places in (mapped, volume))
-        found: dict[str, Any] = {"dilated": bool(dilated)} | _kept_by(weights, of_rays, of_volume)
-        if len(set(cells.shape)) == 1:
-            kept = cells >= threshold_losing(weights, of_rays, LOST_SURFACE_MASS)
-            found["octree_bytes"] = octree_bytes(kept)
-        both.append(found)
+        found = {"dilated": bool(dilated), **_kept_by(weights, of_rays, of_volume)}
+        kept = cells >= threshold_losing(weights, of_rays, LOST_SURFACE_MASS)
+        both.append(found | {"octree_bytes": octree_bytes(kept)})
     return min(both, key=lambda one: one["kept_reached_volume"])
 
 
 def _grids_of(
     mixture: Mixture,
-    resolutions: Sequence[Resolution],
+    resolutions: Sequence[int],
     taught: Tensor,
     mapped: Tensor,
     weights: Tensor,
@@ -186,16 +182,9 @@ def _grids_of(
     known = taught, density_of(mixture, taught)
     filling = FieldGrids(partial(density_of, mixture), box, known, floor_of, most)
     for resolution in resolutions:
-        sizes = (resolution,) * 3 if isinstance(resolution, int) else resolution
-        scores = filling.fill(sizes) if fits_memory(math.prod(sizes)) else None
-        yield (
-            {
-                "resolution": resolution,
-                "bytes": math.ceil(math.prod(sizes) / 8),
-                "update_seconds": round(filling.clock.seconds, 3),
-            },
-            scores,
-        )
+        scores = filling.fill(resolution) if fits_memory(resolution**3) else None
+        row = {"resolution": resolution, "bytes": math.ceil(resolution**3 / 8)}
+        yield row | {"update_seconds": round(filling.clock.seconds, 3)}, scores
 
 
 def _measured(

@@ -4,7 +4,7 @@ cells: the time for 512^3 depends on how much surface they hold."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -36,7 +36,7 @@ class FieldGrids:
     Args:
         known: mapped positions [M, 3] and densities [M] that count too: random places miss a
             surface that fills a thousandth of a cell.
-        floor_of: gives, for the scores [nx, ny, nz] of a grid, the score below which a cell and
+        floor_of: gives, for the scores [n, n, n] of a grid, the score below which a cell and
             its neighbours are empty in finer grids too.
         most: densities that may be evaluated for one grid.
     """
@@ -56,11 +56,11 @@ class FieldGrids:
         self.clock = Clock()
         """The time of the last grid, including those that it was refined from."""
 
-    def fill(self, sizes: Sequence[int]) -> Tensor | None:
-        """Scores [nx, ny, nz] of a grid, refined from the one before if that is half as fine; None
+    def fill(self, cells: int) -> Tensor | None:
+        """Scores [n, n, n] of a grid, refined from the one before if that is half as fine; None
         where it would ask more than `most`."""
-        steps = halvings(sizes, () if self.scores is None else self.scores.shape)
-        if self.scores is None or tuple(2 * n for n in self.scores.shape) != steps[0]:
+        steps = halvings(cells, 0 if self.scores is None else len(self.scores))
+        if self.scores is None or 2 * len(self.scores) != steps[0]:
             self.scores, self.floor, self.clock = None, 0.0, Clock()
         self.clock.start()
         for step in steps:
@@ -74,33 +74,29 @@ class FieldGrids:
         return self.scores
 
 
-def halvings(sizes: Sequence[int], known: Sequence[int]) -> list[tuple[int, ...]]:
-    """Sizes of the grids to fill on the way to one, from that of the known grid, coarse to fine."""
-    steps = [tuple(sizes)]
-    while (
-        max(steps[0]) > ASK_ALL
-        and all(n % 2 == 0 for n in steps[0])
-        and steps[0] != tuple(2 * n for n in known)
-    ):
-        steps.insert(0, tuple(n // 2 for n in steps[0]))
+def halvings(cells: int, known: int) -> list[int]:
+    """Cells along an axis of the grids to fill on the way from the known one, coarse to fine."""
+    steps = [cells]
+    while steps[0] > ASK_ALL and steps[0] % 2 == 0 and steps[0] != 2 * known:
+        steps.insert(0, steps[0] // 2)
     return steps
 
 
 def cells_to_ask(
-    sizes: Sequence[int],
+    cells: int,
     coarser: Tensor | None = None,
     floor: float = 0.0,
     device: torch.device | str = "cpu",
 ) -> Tensor:
     """Cells not known to be empty by a coarser grid's scores, half as fine: bool [nx, ny, nz]."""
     if coarser is None:
-        return torch.ones(*sizes, dtype=torch.bool, device=device)
+        return torch.ones((cells,) * 3, dtype=torch.bool, device=device)
     near = dilate(coarser) >= floor
     return near.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
 
 
-def probes_in_a_cell(sizes: Sequence[int]) -> int:
-    return max(FEWEST_PROBES, PROBES_ALONG // max(sizes))
+def probes_in_a_cell(cells: int) -> int:
+    return max(FEWEST_PROBES, PROBES_ALONG // cells)
 
 
 def fill_cells(
@@ -114,7 +110,7 @@ def fill_cells(
     generator = torch.Generator(device).manual_seed(0)
     for cells in asked.nonzero().split(CELLS_AT_ONCE):
         best = torch.zeros(len(cells), device=device)
-        for _ in range(probes_in_a_cell(asked.shape)):
+        for _ in range(probes_in_a_cell(max(asked.shape))):
             units = cells + torch.rand(len(cells), 3, device=device, generator=generator)
             places = torch.lerp(box.low, box.high, units / counts)
             best = torch.maximum(best, density(places).float())

@@ -115,11 +115,6 @@ def test_grids_are_measured_like_the_gate(mixture: Mixture) -> None:
     assert even["update_seconds"] > 0.0
 
 
-def test_a_grid_of_another_size_along_each_axis_is_measured_too(mixture: Mixture) -> None:
-    (row,) = at_equal_loss(mixture, None, grids=((4, 3, 2),))["grids"]
-    assert row["bytes"] == 3 and row["kept_reached_volume"] == pytest.approx(0.5, abs=0.01)
-
-
 def test_a_coarse_grid_hears_of_a_surface_that_random_places_miss(
     mixture: Mixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -22,7 +22,7 @@ from leco_plugin.evaluation.field_grids import (
 from leco_plugin.evaluation.inspection import ViewBox
 
 BOX = ViewBox(torch.tensor([-1.0, -1.0, -0.5]), torch.tensor([1.0, 1.0, 0.5]))
-CUBE, FINE = (16, 16, 16), (32, 32, 32)
+CUBE, FINE = 16, 32
 
 
 def ball(mapped: Tensor) -> Tensor:
@@ -74,10 +74,10 @@ def test_a_known_surface_is_never_missed_by_a_coarse_cell() -> None:
 
     seen = torch.tensor([[0.3, 0.3, 0.061], [0.3, 0.3, 0.7]])  # the second lies outside
     known = seen, torch.tensor([1.0, 5.0])
-    scores = fill_cells(film, BOX, cells_to_ask((8, 8, 8)), known=known)
+    scores = fill_cells(film, BOX, cells_to_ask(8), known=known)
     assert float(look_up_scores(scores, BOX, seen[:1])) == 1.0
     assert float(scores.sum()) == 1.0
-    assert float(fill_cells(film, BOX, cells_to_ask((8, 8, 8))).sum()) == 0.0
+    assert float(fill_cells(film, BOX, cells_to_ask(8)).sum()) == 0.0
 
 
 def test_memory_is_looked_at_before_a_grid_is_filled(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -101,11 +101,10 @@ def slow_refined(coarse: Tensor, floor: float, density: Tensor) -> Tensor:
 @pytest.mark.parametrize("seed", range(3))
 def test_a_cell_is_asked_where_the_coarser_grid_has_not_ruled_it_out(seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
-    sizes = (12, 16, 8)
-    cells = torch.rand(sizes, generator=generator)  # the same density anywhere in a cell
-    coarse = torch.rand(6, 8, 4, generator=generator)
+    cells = torch.rand(12, 12, 12, generator=generator)  # the same density anywhere in a cell
+    coarse = torch.rand(6, 6, 6, generator=generator)
     found = fill_cells(
-        partial(look_up_scores, cells, BOX), BOX, cells_to_ask(sizes, coarse, floor=0.98)
+        partial(look_up_scores, cells, BOX), BOX, cells_to_ask(12, coarse, floor=0.98)
     )
     expected = slow_refined(coarse, 0.98, cells)
     assert 0 < int((found > 0).sum()) < found.numel()
@@ -129,12 +128,12 @@ def test_known_places_count_like_a_loop_over_them() -> None:
 
 
 def test_a_fine_grid_is_reached_by_halves() -> None:
-    assert halvings((32,) * 3, ()) == [(32,) * 3]
-    assert halvings((64,) * 3, (32,) * 3) == [(64,) * 3]
-    assert halvings((512,) * 3, ()) == [(n,) * 3 for n in (64, 128, 256, 512)]
-    assert halvings((512,) * 3, (128,) * 3) == [(256,) * 3, (512,) * 3]
-    assert halvings((100, 100, 40), ()) == [(50, 50, 20), (100, 100, 40)]
-    assert halvings((100, 75, 40), (50, 50, 20)) == [(100, 75, 40)]
+    assert halvings(32, 0) == [32]
+    assert halvings(64, 32) == [64]
+    assert halvings(512, 0) == [64, 128, 256, 512]
+    assert halvings(512, 128) == [256, 512]
+    assert halvings(100, 0) == [50, 100]
+    assert halvings(75, 50) == [75]
 
 
 def test_a_grid_serves_the_next_one_only_if_that_is_twice_as_fine() -> None:
@@ -148,7 +147,7 @@ def test_a_grid_serves_the_next_one_only_if_that_is_twice_as_fine() -> None:
         grids = FieldGrids(counted, BOX, None, lambda scores: 0.5)
         for n in resolutions:
             before = sum(asked)
-            scores = grids.fill((n,) * 3)
+            scores = grids.fill(n)
         assert scores.shape == (n,) * 3 and grids.clock.seconds > 0.0
         return sum(asked) - before
 
