@@ -52,8 +52,7 @@ def stored_bytes(row: Row) -> int:
 
 
 def choose(rows: Sequence[Row]) -> Row:
-    """The one beside which no other keeps so much less that its bytes pay; what keeps all is
-    none."""
+    """The one beside which no other keeps so much less that its bytes pay."""
     power = -math.log10(WORTH_TEN_TIMES)
 
     def worth(row: Row) -> tuple[bool, float, int]:

@@ -73,8 +73,8 @@ class Loss(NamedTuple):
 def gather(
     mixture: Mixture | None, occupancy: Occupancy | None, seen: Seen
 ) -> tuple[Evidence, list[Rendered]]:
-    """Candidates of rays with their worth, all kept without an original; and renderings by a
-    model."""
+    """Candidates of rays with their worth, and renderings by a model; without an original all are
+    kept."""
     pieces, rendered = [], []
     parts = in_chunks(seen.rays, RAYS_AT_ONCE), seen.truth.split(RAYS_AT_ONCE)
     for rays, truth in zip(*parts):

@@ -59,8 +59,7 @@ class Reference(NamedTuple):
     name: str
     mixture: Mixture | None
     lost_before: float
-    """Share of the surface mass, or without a field of the decisions, that the original has lost.
-    """
+    """Share of the surface mass that the original has lost; without a field, of decisions."""
     mass_before: float
     """The same of all rendering weight."""
     price_before: float

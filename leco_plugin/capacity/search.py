@@ -92,8 +92,7 @@ def grids(resolutions: tuple[int, ...]) -> list[Candidate]:
 
 
 def ladder(most_values: int) -> list[GateConfig]:
-    """The gates that `leco shrink` tries, by size: all with fewer values. One scene expert is
-    enough."""
+    """The gates that `leco shrink` tries, by size: all with fewer values, one scene expert each."""
     found = [
         GateConfig(EncodingConfig(octaves=octaves), width, layers, 1, octaves < ENOUGH_OCTAVES)
         for octaves, width, layers in FREQUENCY
@@ -135,8 +134,7 @@ def name_of(config: GateConfig) -> str:
 
 
 STEPS, LONGER, NEARLY = 3000, 3, 3.0
-"""Steps of teaching; `LONGER` times as many where a loss is at most `NEARLY` times what is allowed.
-"""
+"""Steps of teaching; `LONGER` times as many for a loss of at most `NEARLY` times the limit."""
 EMPHASIS, WEIGHT_AT_FULL = 8.0, 0.05
 """How much more a candidate with at least this rendering weight counts."""
 MARGIN = 0.5
@@ -227,8 +225,7 @@ def lesson_of(original: Occupancy, taught: Evidence) -> Lesson:
 def _measure(
     ground: Ground, smaller: Occupancy, bounds: Bounds, volume: Tensor, kept: float, look: int
 ) -> tuple[Rung, Occupancy]:
-    """What is found of a gate, and the gate with its threshold. A look would have the number
-    `look`."""
+    """What is found of a gate, and the gate with its threshold; `look` is the next one's number."""
     losses_at = _losses_of(smaller, ground.references)
     of_volume = in_parts(smaller.query, volume)
     lost, holds, ratio = 0.0, False, 0.0

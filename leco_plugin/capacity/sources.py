@@ -103,8 +103,7 @@ def _load_run(folder: Path, data: Path) -> Source | None:
 
 
 def check_scene(source: Source, occupancy: Occupancy, data: Path) -> None:
-    """Raises `InputError` where fewer than half of the cameras that an occupancy's report names
-    took the photographs."""
+    """Raises `InputError` where fewer than half of the occupancy's cameras took the photographs."""
     known = cameras_of(occupancy)
     if len(known) == 0:
         return
@@ -150,8 +149,7 @@ def draw_training_rays(source: Source, occupancy: Occupancy, count: int) -> Seen
 def draw_other_pixels(
     source: Source, occupancy: Occupancy, count: int, besides: Iterable[Seen]
 ) -> Seen:
-    """Rays of different training pixels, besides others; fewer where there are hardly more
-    pixels."""
+    """Rays of different training pixels, besides others; fewer in small photographs."""
     known = [_numbers(seen.pixels) for seen in besides if seen.pixels is not None]
     taken = np.concatenate([np.empty(0, np.int64), *known])
     pieces: list[tuple[Tensor, Tensor]] = []

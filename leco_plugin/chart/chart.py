@@ -249,8 +249,7 @@ def why_not_shared(source: Path, settings: Mapping[str, Any]) -> str | None:
 
 
 def take_over(folder: RunFolder, missing: Sequence[Job], sources: Sequence[Path]) -> list[Job]:
-    """Copies missing runs, each from the first folder of a chart that has it; returns their
-    jobs."""
+    """Copies missing runs, each from the first chart that has it; returns their jobs."""
     left, taken = list(missing), []
     for source in sources:
         for name, record in stored_in(source).items():

@@ -58,11 +58,6 @@ class Learned(Line):
         return statistics.median(values) if values else None
 
     @cached_property
-    def psnr_by_seed(self) -> dict[int, float]:
-        """dB."""
-        return {run["seed"]: run["psnr"] for run in self.runs}
-
-    @cached_property
     def kept_by_seed(self) -> dict[int, float]:
         """Percent of the space, of each seed of which it was measured."""
         found = {facts["seed"]: figure_in(facts, KEPT_WHEN_FROZEN) for facts in self.facts}
@@ -168,7 +163,7 @@ def last_gain(line: Line) -> float | None:
 
 
 def still_rising(lines: Sequence[Line]) -> list[str]:
-    """Names of lines that gained more than `ENOUGH` in the last third, or nobody knows, or whose
+    """Names of lines that gained more than `ENOUGH` in the last third, as far as is known, or whose
     grid has skipped nothing yet or has taken the time of training."""
 
     def rises(line: Line) -> bool:
@@ -199,8 +194,7 @@ def settling(lines: Sequence[Line]) -> str:
 
 
 def falls(lines: Sequence[Line]) -> str | None:
-    """Which lines have runs that end more than `FALL` below their own best point; None without
-    any."""
+    """Lines with runs that end more than `FALL` below their best point; None without any."""
     fallen = []
     for line in lines:
         below = [max(psnr for _, psnr in run["curve"]) - run["curve"][-1][1] for run in line.runs]

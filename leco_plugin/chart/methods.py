@@ -353,8 +353,7 @@ SUITES = {
 
 
 def in_order(names: Sequence[str]) -> list[str]:
-    """Names of suites in the order of `SUITES`, `all` replaced; an `InputError` for an unknown
-    one."""
+    """Names of suites in the order of `SUITES`; an `InputError` for an unknown one."""
     for name in names:
         if name not in SUITES and name != ALL:
             listed = ", ".join(SUITES)

@@ -143,7 +143,8 @@ def learned_panel(lines: Sequence[Line]) -> Panel:
     numbers = {line.name: i for i, line in enumerate(lines)}
     points = []
     for one in (one for one in learned_of(lines) if one.is_measured):
-        seeds = tuple((one.psnr_by_seed[seed], kept) for seed, kept in one.kept_by_seed.items())
+        psnrs = {run["seed"]: run["psnr"] for run in one.runs}
+        seeds = tuple((psnrs[seed], kept) for seed, kept in one.kept_by_seed.items())
         late = " (frozen at the end)" if one.guided_nothing == one.seeds else ""
         points.append(Point(one.name + late, one.psnr, one.kept, numbers[one.name], seeds))
     return Panel("space kept at equal loss, against PSNR, dB", tuple(points), more_x=True)

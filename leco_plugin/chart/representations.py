@@ -156,8 +156,7 @@ def fronts_of(one: Representation, all_of_them: Sequence[Representation]) -> lis
 
 
 def verdict(representations: Sequence[Representation]) -> str:
-    """What of ours nothing as cheap beats in space, and what does, by medians; or that seeds do not
-    tell."""
+    """What of ours no cheaper occupancy beats in space, and what does: by medians of seeds."""
     ours = [one for one in representations if one.ours]
     if not ours:
         return "our own gate was not frozen with every seed"

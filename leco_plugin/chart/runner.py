@@ -63,8 +63,7 @@ class RunFolder:
 
     @contextmanager
     def alone(self) -> Iterator[None]:
-        """Deletes what killed processes left, and keeps others from making jobs here:
-        `InputError`."""
+        """Deletes what killed processes left; an `InputError` where another process makes jobs."""
         with alone_in(self.path, "chart"):
             self.clear()
             yield

@@ -185,8 +185,7 @@ class Line:
         return middle_of([cost.of(run) for run in self.runs])
 
     def curve(self) -> tuple[NDArray[np.float64], ...]:
-        """Mean seconds [T], and mean, lowest and highest PSNR [T] at equal shares of the
-        training."""
+        """Mean seconds [T]; mean, lowest and highest PSNR [T] at equal shares of training."""
         curves = [np.array(run["curve"], dtype=float) for run in self.runs]
         ends = np.array([curve[-1, 0] for curve in curves])
         begin = max(curve[0, 0] / end for curve, end in zip(curves, ends))
@@ -247,8 +246,7 @@ def front(points: Sequence[tuple[float, float]]) -> list[int]:
 
 
 def best_so_far(lines: Sequence[Line]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Seconds [T] of training, and the highest mean PSNR [T] that any contender has reached by
-    then."""
+    """Seconds [T] of training, and the highest mean PSNR [T] of any contender by then."""
     curves = [line.curve()[:2] for line in lines]
     times = np.unique(np.concatenate([seconds for seconds, _ in curves]))
     reached = [np.interp(times, seconds, psnr, left=-np.inf) for seconds, psnr in curves]

@@ -194,8 +194,7 @@ def at_first(passed: Sequence[float | None], first: Sequence[float]) -> list[boo
 def bounded_spread(
     values: Sequence[float | None], form: str, is_bound: Sequence[bool], sign: str
 ) -> str:
-    """As `spread`, with a sign before figures that may be less ("≤") or more ("≥"), as some are
-    bounds."""
+    """As `spread`, with a sign before figures that may be less ("≤") or more ("≥")."""
     said = spread(values, form)
     known = [value for value in values if value is not None]
     bounds = [value for value, bound in zip(values, is_bound) if value is not None and bound]
@@ -254,8 +253,7 @@ def failures_table(failures: Sequence[Mapping[str, Any]]) -> str:
 
 
 def occupancy_table(learned: Sequence[Learned]) -> str:
-    """Occupancies: medians over seeds with a frozen gate. Size and true surface kept are of the
-    end."""
+    """Medians over seeds with a frozen gate. Size and true surface kept are of the end."""
 
     def frozen(one: Learned) -> str:
         late = f", {one.guided_nothing} at the end" if one.guided_nothing else ""

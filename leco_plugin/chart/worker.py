@@ -200,8 +200,7 @@ def _occupancy_of(trainer: Trainer, data: Path, folder: Path) -> dict[str, Any] 
 
 
 def main(folder: Path, run: Callable[..., dict[str, Any]] = run_job) -> int:
-    """Makes the run that a folder describes, by a function as `run_job`; 0, or 1 and a reason in
-    the folder."""
+    """Makes the run that a folder describes, by a function as `run_job`; 0, or 1 on failure."""
     from leco_plugin.chart.contender import Contender, Protocol
     from leco_plugin.evaluation.clock import seconds_now
     from leco_plugin.evaluation.report import describe_code

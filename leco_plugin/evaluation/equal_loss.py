@@ -210,8 +210,7 @@ def mapped_box(mixture: Mixture) -> ViewBox:
 
 
 def reached_volume(mixture: Mixture, taught: Tensor, count: int, seed: int = 0) -> Tensor:
-    """Mapped positions [P, 3], P <= count, in the cells of mapped candidates `taught` [M, 3] of
-    rays."""
+    """Mapped positions [P, 3], P <= count, in the cells of candidates `taught` [M, 3]."""
     positions = whole_box(mixture.occupancy()).draw(count, seed).to(mixture.device)
     mapped = mixture.region.space.map(positions).clamp(-1.0, 1.0)
     return mapped[is_reached(taught, mapped)]

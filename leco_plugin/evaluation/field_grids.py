@@ -102,8 +102,7 @@ def probes_in_a_cell(cells: int) -> int:
 def fill_cells(
     density: Density, box: ViewBox, asked: Tensor, known: tuple[Tensor, Tensor] | None = None
 ) -> Tensor:
-    """Scores [nx, ny, nz] of cells, zero where neither asked nor known: positions, densities
-    [M]."""
+    """Scores [nx, ny, nz] of cells, zero where they are neither asked nor known."""
     device = box.low.device
     scores = torch.zeros(asked.shape, device=device)
     counts = torch.tensor(asked.shape, device=device)

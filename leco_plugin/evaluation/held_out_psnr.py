@@ -96,8 +96,7 @@ class HeldOutPsnr:
 
     @torch.no_grad()
     def _psnr_of(self, pixels: list[tuple[RayBundle, Tensor]]) -> float:
-        """PSNR of rendered rays, by chunks with true colours [R, 3 or 4]; notes that of their
-        mean."""
+        """PSNR of rendered rays, by chunks with true colours [R, 3 or 4]; notes `of_one_colour`."""
         device = self.model.device
         devices = [device] if torch.device(device).type == "cuda" else []
         with torch.random.fork_rng(devices), evaluating(self.model):

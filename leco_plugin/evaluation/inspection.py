@@ -168,8 +168,7 @@ def scene_of(occupancy: Occupancy, file: Path, data: Path | None) -> Path | None
 
 
 def to_the_data(occupancy: Occupancy) -> Tensor | None:
-    """Takes positions of the run to those of the data's own files: [3, 4] float64, None if
-    unknown."""
+    """From positions of the run to those of the data's files: [3, 4] float64, None if unknown."""
     frame = occupancy.report.get("data_frame") or occupancy.report.get("frame")
     rows = [numbers(row) for row in frame] if isinstance(frame, list) else []
     if [len(row) for row in rows] != [4, 4, 4]:
@@ -213,8 +212,7 @@ def in_parts(function: Callable[[Tensor], Tensor], positions: Tensor) -> Tensor:
 
 
 def exposed(kept: Tensor, beyond: bool = False) -> Tensor:
-    """Kept cells with a skipped neighbour of six: bool [X, Y, Z]. What lies beyond counts as
-    `beyond`."""
+    """Kept cells with a skipped neighbour, bool [X, Y, Z]; cells outside count as `beyond`."""
     skipped = torch.nn.functional.pad(~kept, (1, 1) * 3, value=not beyond)
     shifts = [skipped.roll(step, axis) for axis in range(3) for step in (-1, 1)]
     return kept & torch.stack(shifts).any(dim=0)[1:-1, 1:-1, 1:-1]

@@ -82,8 +82,7 @@ def write_page(occupancy: Occupancy, path: Path, colours: SceneColours | None = 
 
 
 def faces_of(inside: Tensor, box: ViewBox, beyond: bool) -> Tensor:
-    """Faces [F, 4, 3] between cells inside, bool [X, Y, Z], and others; outside counts as
-    `beyond`."""
+    """Faces [F, 4, 3] between cells inside, bool [X, Y, Z], and others, outside `beyond`."""
     counts = torch.tensor(inside.shape)
     framed = torch.nn.functional.pad(inside, (1, 1) * 3, value=beyond)
     found = []

@@ -89,9 +89,7 @@ def digest_of_sources(*folders: Path) -> str:
 
 def usable_cores() -> int:
     """Cores that this process may use, which in a container can be fewer than there are."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(os.sched_getaffinity(0))
 
 
 def processor_name() -> str:

@@ -111,8 +111,7 @@ def contender_of(
     settings: Mapping[str, Any],
     grid_levels: int = 1,
 ) -> Contender:
-    """The sampler in its host under the conditions of a case, some of which are about learning
-    only."""
+    """The sampler in its host under the conditions of a case."""
     name = sampler.name
     in_nerfacto = name in (PROPOSALS, DENSE_PROPOSAL)
     own: dict[str, Any] = {"occupancy.sampler": name}
@@ -129,8 +128,7 @@ def contender_of(
     elif name == DENSE:
         own["occupancy.options"] = {"levels": DENSE_LEVELS}
     else:
-        cells = int(name.removeprefix(f"{GRID}-"))
-        options = {"resolution": cells, "levels": grid_levels}
+        options = {"resolution": int(name.removeprefix(f"{GRID}-")), "levels": grid_levels}
         own = {"occupancy.sampler": "occupancy-grid", "occupancy.options": options}
     left_out = () if name == LEARNED else ("occupancy.",)
     asked = {path: value for path, value in changes.items() if not path.startswith(left_out)}

@@ -61,8 +61,7 @@ class Box:
         return np.minimum(*sides).max(1), np.maximum(*sides).min(1)
 
     def meet(self, origins: Array, directions: Array) -> tuple[Array, Array]:
-        """Distances [N], metres, inf for none, at which rays first meet it, and outward normals [N,
-        3]."""
+        """Distances [N], metres, inf for none, at which rays [N, 3] meet it; normals [N, 3]."""
         low, high = np.array(self.low), np.array(self.high)
         enters, leaves = self.span(origins, directions)
         t = np.where(enters > _TINY, enters, leaves)

@@ -113,8 +113,7 @@ def _of_the_same_seeds(some: Runs, others: Runs) -> Runs:
 
 
 def _broken(cell: Cell, bars: Bars, lost: float) -> str:
-    """The first bar that a cell breaks, in words; `lost` is the share of surfaces beyond the
-    reference's."""
+    """The first bar that a cell breaks, in words; `lost` is beyond the reference's share."""
     if cell.gap is not None and cell.gap < -bars.below_reference:
         return f"{-cell.gap:.2f} dB below dense"
     if cell.detail_gap is not None and cell.detail_gap < -bars.detail:

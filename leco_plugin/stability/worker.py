@@ -39,8 +39,7 @@ from leco_plugin.studio.host_models import true_colours
 NEAR = 0.03
 """A sample whose middle is within this share of the surface's distance is near it."""
 RASTER = 3
-"""One pixel in so many is looked at, along diagonals: parts of many pictures say more than few
-whole ones."""
+"""One pixel in so many is looked at, along diagonals."""
 FEWEST_VIEWS = 2
 """Training pictures that show a surface for it to count: one alone does not tell its depth."""
 RAYS_AT_ONCE = 256
