@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from leco_plugin.chart import page, picture
 from leco_plugin.chart.contender import (
     LEARNED,
     SMALL,
@@ -35,6 +36,7 @@ from leco_plugin.chart.runner import (
     stored_in,
 )
 from leco_plugin.chart.table import table
+from leco_plugin.chart.theme import DARK, LIGHT
 from leco_plugin.evaluation.report import describe_code, describe_machine, read_object
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import describe_held_out, describe_scene, megapixels_of
@@ -221,9 +223,6 @@ class Chart:
 
     def draw(self) -> dict[str, Any]:
         """Writes the results, and where a run has succeeded the pictures and `chart.html`."""
-        from leco_plugin.chart import page, picture
-        from leco_plugin.chart.theme import DARK, LIGHT
-
         results = self.write()
         if results["runs"]:
             place = self.folder.path
