@@ -18,17 +18,7 @@ from torch import Tensor
 
 from leco_plugin.samplers.rays import Candidates, March, Rays, number, plan
 
-__all__ = [
-    "Candidates",
-    "March",
-    "NearFn",
-    "OccupiedFn",
-    "Rays",
-    "Samples",
-    "march",
-    "number",
-    "plan",
-]
+__all__ = ["Candidates", "March", "NearFn", "OccupiedFn", "Rays", "Samples", "march", "number"]
 
 OccupiedFn = Callable[[Tensor], Tensor]
 """Positions [N, 3] to bool [N]."""

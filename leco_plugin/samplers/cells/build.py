@@ -66,7 +66,6 @@ def build_cache(
     budget: int = 1 << 20,
     tolerance: float = 1e-4,
     check_points: int = 1 << 20,
-    seed: int = 0,
 ) -> CellCache:
     """The finest cache of a frozen occupancy that fits a budget and keeps its decisions.
 
@@ -78,7 +77,6 @@ def build_cache(
         tolerance: largest share of decisions that may differ from the gate's, at two standard
             deviations above the measured share.
         check_points: number of decisions that are compared.
-        seed: of the random positions that are compared.
 
     Returns:
         The cache, on the occupancy's device, with its report.
@@ -90,13 +88,11 @@ def build_cache(
     device = occupancy.space.center.device
     if device.type == "mps":  # lacks some of what judging takes, none of what looking up takes
         cpu = copy.deepcopy(occupancy).to("cpu")  # type: ignore[attr-defined]
-        cache = build_cache(
-            cpu, budget=budget, tolerance=tolerance, check_points=check_points, seed=seed
-        )
+        cache = build_cache(cpu, budget=budget, tolerance=tolerance, check_points=check_points)
         return CellCache(cache.tables().to(device), occupancy.space, cache.report)
     probe, seen = look(occupancy, PROBE)
     enough = _finest_of_use(probe)
-    compared = _decisions(occupancy, probe != EMPTY, check_points, seed)
+    compared = _decisions(occupancy, probe != EMPTY, check_points)
     report = None
     for margin in MARGINS:
         # after a failure the gate is asked everywhere: the probe may have missed something
@@ -256,10 +252,8 @@ def _with_open_border(tables: Tables) -> Tables:
     )
 
 
-def _decisions(
-    occupancy: OccupancyLike, filled: Tensor, points: int, seed: int
-) -> tuple[Tensor, Tensor]:
-    """Random positions, half of them in filled cells, and the gate's decisions about them.
+def _decisions(occupancy: OccupancyLike, filled: Tensor, points: int) -> tuple[Tensor, Tensor]:
+    """Always the same random positions, half of them in filled cells, and the gate's decisions about them.
 
     Args:
         filled: which cells of the mapped cube are not empty, bool [n, n, n].
@@ -268,7 +262,7 @@ def _decisions(
         positions in world units [points, 3] and bool [points].
     """
     device = filled.device
-    generator = torch.Generator(device).manual_seed(seed)
+    generator = torch.Generator(device).manual_seed(0)
     mapped = torch.rand(points, 3, dtype=torch.float32, device=device, generator=generator)
     cells = filled.nonzero()
     if len(cells):
