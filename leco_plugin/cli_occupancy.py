@@ -26,7 +26,7 @@ def occupancy_of(path: Path) -> Path:
     from leco_plugin.hosts.guided_start import occupancy_file
 
     file = occupancy_file(path)
-    if file is None or not file.exists():
+    if not file.exists():
         raise ValueError(f"there is no occupancy.safetensors in {path}: {give}")
     return file
 

@@ -215,9 +215,8 @@ class Guide(nn.Module):
         Raises:
             InputError: the sampler has nothing for proposal hosts, or not all of its options.
         """
-        needs_occupancy = self._spec("proposal").needs_occupancy
-        made = GuidedProposal(self, options)
-        if not needs_occupancy:
+        spec, made = self._spec("proposal"), GuidedProposal(self, options)
+        if not spec.needs_occupancy:
             _ = made.sampler  # what is wrong with its options is said now
         return made
 

@@ -81,10 +81,10 @@ class OccupancyConfig:
     """Without a path: the HMoE that learns."""
 
 
-def occupancy_file(path: Path | None) -> Path | None:
+def occupancy_file(path: Path) -> Path:
     """The file that `path` means: itself, or the newest occupancy in the folder of a run. No error
     where there is none: a checkpoint brings its own."""
-    if path is None or not path.is_dir():
+    if not path.is_dir():
         return path
     found = sorted(path.rglob(FILE_NAME), key=lambda file: file.stat().st_mtime)
     return found[-1] if found else path / FILE_NAME
@@ -93,7 +93,6 @@ def occupancy_file(path: Path | None) -> Path | None:
 def load_occupancy(path: Path) -> Occupancy:
     """The occupancy that `path` means. InputError if there is none, or it cannot be read."""
     file = occupancy_file(path)
-    assert file is not None
     try:
         return Occupancy.load(file)
     except FileNotFoundError:

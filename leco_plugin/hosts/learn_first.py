@@ -80,7 +80,7 @@ def learn_model(
             "this run would learn an occupancy for ever: with homogeneous, or schedule.freeze "
             "False, none is frozen. Those are for leco-occupancy, which guides no other method"
         )
-    model: Any = config.setup(
+    model: LecoModel = config.setup(
         scene_box=dataset.scene_box,
         num_train_data=len(dataset),
         metadata={**(dataset.metadata or {}), CAMERAS: dataset.cameras},
@@ -98,8 +98,7 @@ def learn_model(
         learner.begin()
         with bar("Learning the occupancy") as show:
             _train(model, trained, learner, seconds, _with_psnr(model, manager, show))
-    learned: LecoModel = model
-    return learned
+    return model
 
 
 def _with_psnr(model: LecoModel, manager: Any, show: Show) -> Callable[[float], None]:

@@ -147,16 +147,12 @@ def _proposal_samplers(host: nn.Module) -> list[Any]:
 
 def _swap_proposal(host: Model, guide: Guide) -> None:
     for old in _proposal_samplers(host):
-        initial = old.initial_sampler
-        replace_module(
-            host,
-            old,
-            guide.proposal(
-                num_samples=old.num_nerf_samples_per_ray,
-                initial_sampler=initial,
-                single_jitter=bool(getattr(initial, "single_jitter", False)),
-            ),
+        new = guide.proposal(
+            num_samples=old.num_nerf_samples_per_ray,
+            initial_sampler=old.initial_sampler,
+            single_jitter=bool(getattr(old.initial_sampler, "single_jitter", False)),
         )
+        replace_module(host, old, new)
     _remove_density_networks(host)
     guide.without_proposals = True
 

@@ -25,7 +25,6 @@ def test_a_file_a_folder_and_the_newest_in_a_folder(tmp_path: Path) -> None:
     assert occupancy_file(older) == older
     assert occupancy_file(run) == older
     assert occupancy_file(tmp_path) == newer
-    assert occupancy_file(None) is None
 
 
 def bad_paths(folder: Path) -> dict[str, tuple[Path, str]]:
