@@ -253,7 +253,7 @@ def _with_open_border(tables: Tables) -> Tables:
 
 
 def _decisions(occupancy: OccupancyLike, filled: Tensor, points: int) -> tuple[Tensor, Tensor]:
-    """Always the same random positions, half of them in filled cells, and the gate's decisions about them.
+    """Random positions, always the same, half in filled cells, and what the gate decides there.
 
     Args:
         filled: which cells of the mapped cube are not empty, bool [n, n, n].
