@@ -180,7 +180,8 @@ def _check_described(ray_samples: Any, rays: Any) -> None:
     ):
         require(found is not None, f"the rays have {name}, and their samples have none")
         wanted = given[:, None].expand_as(ray_samples.frustums.starts)
-        require(torch.equal(found, wanted), f"{name} of samples are not those of their rays")
+        equal = found is not None and torch.equal(found, wanted)
+        require(equal, f"{name} of samples are not those of their rays")
 
 
 def _edges(ray_samples: Any) -> tuple[Tensor, Tensor]:

@@ -147,8 +147,8 @@ def check_shifts(case: SamplerCase) -> None:
 def no_gradient_to_the_gate(case: SamplerCase) -> None:
     """A loss on rendered colours moves the host's field, and never the frozen gate."""
     sampler, field = case.shared(SLAB).train(), Field()
-    optimised = (part.clone().requires_grad_() for part in crossing()[:2])  # as cameras may be
-    rays = Rays(*optimised, *crossing()[2:])
+    origins, directions = (part.clone().requires_grad_() for part in crossing()[:2])
+    rays = crossing()._replace(origins=origins, directions=directions)  # cameras may be optimised
     colours = case.colours(sampler, rays, field)
     require(torch.is_grad_enabled(), "sampling leaves gradients switched off")
     colours.square().sum().backward()

@@ -193,8 +193,11 @@ def ray_prices(
             len(truth),
         )
         found.append(torch.stack([*of_rays.unbind(dim=-1), dense_error, gated_error]).double())
-    together: Any = torch.cat(found, dim=-1) if found else torch.zeros(6, 0)
-    return RayPrices(*together, skipped, candidates)
+    together = torch.cat(found, dim=-1) if found else torch.zeros(6, 0)
+    surface, lost_surface, lost, weight, dense_error, gated_error = together.unbind()
+    return RayPrices(
+        surface, lost_surface, lost, weight, dense_error, gated_error, skipped, candidates
+    )
 
 
 def measure(

@@ -58,6 +58,7 @@ class PriceSource(Protocol):
 
     def prepare(self) -> None:
         """Called before a measurement in every process; only the first one measures."""
+        return None
 
     def excesses(self, seed: int) -> dict[str, Tensor]:
         """By how much rays [R] are beyond the bound of each price, by its name: above 0 is too

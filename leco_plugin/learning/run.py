@@ -40,9 +40,11 @@ class Run(Protocol):
 
     def save(self, step: int) -> None:
         """Saves a checkpoint, if it saves any."""
+        return None
 
     def forget(self, groups: dict[str, list[nn.Parameter]]) -> None:
         """Has optimizers forget all parameters but these, by the names of their groups."""
+        return None
 
 
 class LearningOnly(Run):

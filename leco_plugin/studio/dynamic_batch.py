@@ -84,8 +84,9 @@ def clamped(pipeline: Any) -> Any:
     """The config of a pipeline of dynamic batches as one that keeps within bounds; any other as it
     is."""
     target = getattr(pipeline, "_target", None)
-    is_dynamic = isinstance(target, type) and issubclass(target, DynamicBatchPipeline)
-    if not is_dynamic or issubclass(target, ClampedDynamicBatchPipeline):
+    if not isinstance(target, type) or not issubclass(target, DynamicBatchPipeline):
+        return pipeline
+    if issubclass(target, ClampedDynamicBatchPipeline):
         return pipeline
     if type(pipeline) is DynamicBatchPipelineConfig and target is DynamicBatchPipeline:
         values = {f.name: getattr(pipeline, f.name) for f in fields(pipeline)}
