@@ -278,11 +278,7 @@ def _from_elsewhere(meta: dict[str, Any], scene: Path, folder: Path) -> dict[str
         return meta
 
     def from_there(name: str) -> str:
-        path = find_file(scene / name).resolve()
-        try:
-            return Path(os.path.relpath(path, home)).as_posix()
-        except ValueError:  # on another drive of Windows
-            return str(path)
+        return os.path.relpath(find_file(scene / name).resolve(), home)
 
     frames = [
         {key: from_there(value) if key in PATHS else value for key, value in frame.items()}

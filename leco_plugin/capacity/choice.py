@@ -30,9 +30,11 @@ VOLUMES = (0.01, 0.015, 0.02, 0.03, 0.04, 0.06, 0.08, 0.11, 0.15, 0.2, 0.3, 0.45
 TOLERANCE = 1.05
 """Kept volume that counts as no more than another's."""
 TOLD_APART = 1.2
-"""From this ratio of kept volumes on, one field and one seed tell two apart."""
+"""A representation certainly keeps more than another from this ratio of kept volumes on: all is
+measured with one field and one seed."""
 WORTH_TEN_TIMES = 2 / 3
-"""Ten times the bytes must leave at most this share of the kept volume."""
+"""Ten times the bytes must leave at most this share of the kept volume. The largest nearly always
+keep a little less, and a scene would otherwise need the last one that is tried."""
 USUAL_GRID = 128
 """Cells along an axis of the grids that hosts have by default, which any of them can afford."""
 LEAST = 1e-5
@@ -214,6 +216,7 @@ def circumstances(results: Mapping[str, Any]) -> str:
 
 
 LEAST_OF_A_GATE = 1e-6
+"""Lost surface mass that is drawn for none at all."""
 
 
 def line_of_original(itself: Rung, measured: bool) -> str:

@@ -246,7 +246,12 @@ def capacity(
         "teach_steps": STEPS,
         "grids": "by the lesson of the gates",
     }
-    take_folder(out / SETTINGS, {"scene": scene, **settings}, "points with another", DAMAGED)
+    file = out / SETTINGS
+    if file.is_file() and read_object(file, DAMAGED).get("scene") != scene:
+        raise InputError(
+            f"{out} holds points of another scene than {data}; name a new folder with --out"
+        )
+    take_folder(file, {"scene": scene, **settings}, "points with another", DAMAGED)
     candidates = [*gates(), *_grids_that_fit(resolutions)]
     taught = prepare(data, out, learn_steps)
     rows = _measure_missing(out, taught, candidates, lost_surface_mass, code)

@@ -14,7 +14,7 @@ from leco_plugin.chart.summary import Line, compare, figure_in, middle_of
 OURS = "(ours)"
 """Marks the contender that a suite asks about."""
 KEPT_WHEN_FROZEN = "at_equal_loss.kept_reached_volume"
-"""Share of the volume reached by rays."""
+"""Share of what rays reach that a gate keeps at equal loss."""
 AT_THE_END = 0.99
 """Share of the training time; a gate that is frozen later has guided nothing."""
 

@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 
     from leco_plugin.chart.contender import Contender, Protocol
 
+    Show = Callable[[float], None]
+    Make = Callable[[Contender, int, Path, Protocol, Path, Show], dict[str, Any]]
+    """Makes a run of a seed on a scene, and leaves its files in a folder, as `run_job`."""
+
 WORKER = (sys.executable, "-W", "ignore", "-m", "leco_plugin.chart.worker")
 SMALL_GATES = {
     "MLP": "frequency-6-32-2",
@@ -199,7 +203,7 @@ def _occupancy_of(trainer: Trainer, data: Path, folder: Path) -> dict[str, Any] 
     return occupancy_facts(occupancy, file, manager, truth_of(folder_of(data), manager))
 
 
-def main(folder: Path, run: Callable[..., dict[str, Any]] = run_job) -> int:
+def main(folder: Path, run: Make = run_job) -> int:
     """Makes the run that a folder describes, by a function as `run_job`; 0, or 1 on failure."""
     from leco_plugin.chart.contender import Contender, Protocol
     from leco_plugin.evaluation.clock import seconds_now

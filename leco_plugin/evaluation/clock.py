@@ -115,7 +115,8 @@ def peak_process_bytes() -> int:
 
 
 def forget_peaks() -> bool:
-    """Makes later peaks those of what follows, if the system can do so."""
+    """Makes later peaks those of what follows, what is in use included; returns whether the system
+    can."""
     gc.collect()
     with suppress(OSError, AttributeError):  # no glibc
         ctypes.CDLL("libc.so.6").malloc_trim(0)  # our models on a CPU keep memory that is free

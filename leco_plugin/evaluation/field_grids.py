@@ -88,7 +88,8 @@ def cells_to_ask(
     floor: float = 0.0,
     device: torch.device | str = "cpu",
 ) -> Tensor:
-    """Cells not known to be empty by a coarser grid's scores, half as fine: bool [nx, ny, nz]."""
+    """Cells not known to be empty: bool [n, n, n]. One is known so where the scores of a grid half
+    as fine are all below `floor` around it."""
     if coarser is None:
         return torch.ones((cells,) * 3, dtype=torch.bool, device=device)
     near = dilate(coarser) >= floor

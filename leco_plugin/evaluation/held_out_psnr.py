@@ -22,9 +22,9 @@ from leco_plugin.studio.host_models import true_colours
 FIRST_AFTER, BETWEEN = 8.0, 10.0
 """Seconds before the first measurement, and between two."""
 SHARE_OF_TIME = 0.01
-"""Of the time so far; the first and the last measurement may exceed it."""
+"""Of the time so far that all measurements may take; the first and the last may exceed it."""
 OLD, SHARE_WHEN_OLD = 30.0, 0.03
-"""Seconds after which PSNR is measured at so much of them."""
+"""Seconds after which PSNR is measured again where that takes at most so much of them."""
 RAYS, FEWEST_LAST, MOST_LAST = 256, 1024, 8192
 """Rays of a measurement; fewest and most of the last."""
 OF = "on held-out pixels"

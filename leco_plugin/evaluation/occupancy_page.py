@@ -28,11 +28,11 @@ from leco_plugin.evaluation.occupancy_picture import (
 from leco_plugin.occupancy import Occupancy
 
 CELLS = (128, 96, 72, 48, 32)
-"""Along the longest side."""
+"""Along the longest side of the kept volume: the most with which there are few enough faces."""
 MOST_FACES = 60_000
 SEEN_CELLS = 32
 COLOURS = 256
-"""Of a palette."""
+"""Of a palette: a colour by its number takes a byte for each face."""
 CORNERS = torch.tensor([[0, 0], [1, 0], [1, 1], [0, 1]])
 EYE = {"eye": {"x": 0.9, "y": -1.2, "z": 1.0}, "center": {"x": 0.0, "y": 0.0, "z": -0.1}}
 LIGHTING = {"ambient": 0.85, "diffuse": 0.4, "specular": 0.02, "fresnel": 0.0}
@@ -82,7 +82,12 @@ def write_page(occupancy: Occupancy, path: Path, colours: SceneColours | None = 
 
 
 def faces_of(inside: Tensor, box: ViewBox, beyond: bool) -> Tensor:
-    """Faces [F, 4, 3] between cells inside, bool [X, Y, Z], and others, outside `beyond`."""
+    """Faces between cells that are inside a set and those that are not: corners [F, 4, 3].
+
+    Args:
+        inside: bool [X, Y, Z], of the cells of a box.
+        beyond: whether cells beyond the box count as inside.
+    """
     counts = torch.tensor(inside.shape)
     framed = torch.nn.functional.pad(inside, (1, 1) * 3, value=beyond)
     found = []

@@ -26,7 +26,7 @@ from leco_plugin.occupancy import Occupancy
 
 KINDS = ("field", "proposal", "learning", "gate")
 """Who is asked: the field that is rendered; proposal networks; another field, which learned the
-occupancy; a frozen gate without its cell cache."""
+occupancy; a frozen gate, where its cell cache gave no answer."""
 
 
 @contextmanager

@@ -85,7 +85,7 @@ class TimedRun:
     """In all of the training."""
     render_seconds_per_image: float = 0.0
     peak_memory_bytes: int | None = 0
-    """Of the allocator on CUDA, of the process elsewhere."""
+    """Of the allocator on CUDA, of the process elsewhere; None where it may be other work's."""
     peak_process_bytes: int | None = 0
     peak_allocator_bytes: int | None = None
     curve: list[tuple[float, float]] = field(default_factory=list)

@@ -43,10 +43,12 @@ def description_of_run(file: Path) -> Path | None:
 
     config = file.resolve().parent / CONFIG
     data = _data_named_in(config)
-    for place in () if data is None else (data, found_around(data, config.parent)):
-        if place is not None and (found := file_in(place)).is_file():
-            return found
-    return None
+    if data is None:
+        return None
+    if (found := file_in(data)).is_file():
+        return found
+    moved = found_around(data, config.parent)
+    return found if moved is not None and (found := file_in(moved)).is_file() else None
 
 
 def _data_named_in(config: Path) -> Path | None:

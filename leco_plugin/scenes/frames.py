@@ -61,8 +61,14 @@ SAME_PLACE = 1e-3
 
 
 def applied_in(meta: dict[str, Any], folder: Path) -> tuple[Any, float]:
-    """What was done to the scene's coordinates before a transforms.json was written in a folder:
-    `applied_transform` [3, 4], or None, and `applied_scale`."""
+    """What was done to the scene's coordinates before a transforms.json was written.
+
+    Args:
+        meta: what the file says.
+        folder: that it lies in.
+    Returns:
+        `applied_transform` [3, 4], or None, and `applied_scale`.
+    """
     applied = meta.get("applied_transform")
     if applied is None and (folder / "colmap/sparse/0").exists():
         applied = APPLIED_EARLIER
@@ -75,9 +81,17 @@ def from_file(
     applied_scale: float = 1.0,
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """The frame for positions as a transforms.json has them, [3, 4], by that of `frame_of` and what
-    `applied_in` says of the file. Coordinates as large as UTM's need float64. ValueError if they
-    are not finite, or lead nowhere back."""
+    """The frame for positions as a transforms.json has them: [3, 4].
+
+    What ns-process-data has done to poses and points before it wrote them, a frame does too.
+
+    Args:
+        frame: [3, 4] from the scene's coordinates, as of `frame_of`.
+        applied_transform, applied_scale: of that file, as of `applied_in`.
+        dtype: of the frame. Coordinates as large as UTM's need float64.
+    Raises:
+        ValueError: they are not finite, or lead nowhere back.
+    """
     frame = torch.as_tensor(frame, dtype=torch.float64)
     applied = torch.eye(3, 4) if applied_transform is None else applied_transform
     matrix = torch.as_tensor(applied, dtype=torch.float64)
@@ -194,7 +208,8 @@ def distance_from_rotations(matrices: NDArray[np.floating]) -> NDArray[np.floati
 
 
 def check_poses(poses: NDArray[np.floating], names: list[str]) -> None:
-    """InputError, with its name, for one of poses [C, 3 or 4, 4] that is not finite or turned."""
+    """InputError, with its name, for one of poses [C, 3 or 4, 4] that is not finite or no
+    rotation."""
     if poses.shape[1:] not in ((4, 4), (3, 4)):
         raise InputError(f"{names[0]} is no finite 4 x 4 matrix: give it four rows of four")
     broken = ~np.isfinite(poses).all(axis=(1, 2))

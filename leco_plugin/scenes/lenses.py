@@ -64,7 +64,8 @@ class Lens:
 
 
 def lens_of(meta: dict[str, Any], frame: dict[str, Any], where: str) -> Lens:
-    """The lens of a frame, or else of its scene. InputError, with `where` that is, for no lens."""
+    """The lens of a frame, or else of its scene. InputError, with `where` that is,
+    for a number that is none, or a lens that nerfstudio lacks."""
 
     def said(name: str, positive: bool = True) -> float | None:
         value = frame.get(name, meta.get(name))

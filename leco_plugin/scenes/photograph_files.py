@@ -1,7 +1,8 @@
 """The files of photographs and of their masks: there, whole, and such as nerfstudio reads rightly.
 
-nerfstudio reads numbers of a palette as greys, the low bytes of 16 bits, no EXIF, every pixel of a
-mask that is not 0 as seen, and fails in the middle of loading at a file that is cut off.
+nerfstudio takes the numbers of a palette for greys and the low bytes of 16 bits for all of them,
+turns no photograph as its EXIF says, and a file that is cut off ends it in the middle of loading.
+Of a mask, each pixel that is not 0 counts as seen.
 """
 
 from __future__ import annotations
@@ -29,9 +30,15 @@ CONVERTED = ("1", "P", "PA", "LA", "CMYK")
 """Modes that become one of these; of CMYK by Pillow's formula, without a colour profile."""
 SAVE_ANEW = "if the file is whole, save it as JPEG or PNG with 8 bits a channel, and give that name"
 """What to do about HEIC, OpenEXR and other kinds that Pillow does not read."""
-TURN = Image.Transpose
-TURNS = {2: TURN.FLIP_LEFT_RIGHT, 3: TURN.ROTATE_180, 4: TURN.FLIP_TOP_BOTTOM}
-TURNS |= {5: TURN.TRANSPOSE, 6: TURN.ROTATE_270, 7: TURN.TRANSVERSE, 8: TURN.ROTATE_90}
+TURNS = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
 """What sets an image upright, by EXIF's orientation."""
 
 

@@ -17,7 +17,7 @@ from nerfstudio.data.dataparsers import base_dataparser
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
 from PIL import UnidentifiedImageError
 
-from leco_plugin.log import bar, say, say_all
+from leco_plugin.log import bar, say
 from leco_plugin.scenes import photograph_files, scene_file
 from leco_plugin.scenes.frames import check_poses
 from leco_plugin.scenes.input_error import InputError, one_line
@@ -189,7 +189,8 @@ def checked(
     _check_focal_lengths(cameras, images)
     turns = [photograph_files.is_turned(header, size) for header, size in zip(headers, sizes)]
     outputs.image_filenames, lines = _plain_pictures(images, headers, turns, derived)
-    say_all(lines if speak else ())
+    for line in lines if speak else ():
+        say(line)
     if outputs.mask_filenames is not None:
         masks = [Path(path) for path in outputs.mask_filenames]
         masks = photograph_files.convert_masks(masks, images, sizes, derived, speak)
@@ -211,7 +212,8 @@ def _check_focal_lengths(cameras: Cameras, images: list[Path]) -> None:
 def _size_of(
     path: Path, header: Header, lens: Lens | None, wanted: list[int], factor: int
 ) -> tuple[int, int]:
-    """Width and height of a picture as it will be read. InputError unless its lens has them."""
+    """Width and height of a picture as it will be read. InputError unless its lens has them, or is
+    without a size and they are those `wanted`."""
     slack = 1
     if lens is not None and lens.width is not None and lens.height is not None:
         wanted = [int(lens.width) // factor, int(lens.height) // factor]

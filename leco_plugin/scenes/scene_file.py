@@ -315,13 +315,18 @@ def _images_option(folder: Path) -> str:
     return "" if place is None else f" --images-path {shlex.quote(str(place.relative_to(folder)))}"
 
 
+def _first_bytes(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(200)
+
+
 def _converter_for(data: Path) -> str | None:
     """The command that makes a scene of a folder; None where none is known."""
     if not data.is_dir():
         return None
     for sign, kind in CONVERTERS.items():
         mark = BEGIN_WITH.get(sign)
-        if any(mark is None or mark in path.read_bytes()[:200] for path in data.glob(sign)):
+        if any(mark is None or mark in _first_bytes(path) for path in data.glob(sign)):
             source = data / "images" if sign == "images" else data
             command, *options = kind.split()
             place = next((each for each in COLMAP if (data / each / "cameras.bin").is_file()), None)

@@ -126,7 +126,8 @@ def survey(
     far: float | None = None,
 ) -> Survey:
     """Looks at the training cameras of a nerfstudio data manager; near and far, scene units, are
-    found where they are None. InputError if no ray meets the scene, or for a wrong range."""
+    found where they are None. InputError if there is no camera, no ray meets the
+    scene, or for a wrong range."""
     if hasattr(datamanager, "train_unseen_cameras"):
         kind = type(datamanager).__name__
         raise InputError(
@@ -209,7 +210,8 @@ def seen_beyond(dataset: Any, numbers: Tensor, misses: Tensor) -> float:
 
 
 def bright(data: dict[str, Any], chosen: Tensor) -> Tensor:
-    """Whether chosen pixels, bool [side, side] of a grid over a picture, show a thing: bool [N]."""
+    """Whether chosen pixels, bool [side, side] of a grid over a picture [H, W, 3 or 4] in [0, 1],
+    show a thing that no mask hides: bool [N]."""
     image = data["image"]
     height, width = image.shape[:2]
     places = chosen.nonzero() / (len(chosen) - 1) * torch.tensor([height - 1, width - 1])

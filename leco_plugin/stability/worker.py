@@ -37,13 +37,16 @@ from leco_plugin.stability.plan import DENSE_LEVELS
 from leco_plugin.studio.host_models import true_colours
 
 NEAR = 0.03
-"""A sample whose middle is within this share of the surface's distance is near it."""
+"""A sample whose middle is within this share of the surface's distance is near it: the references
+step by about as much."""
 RASTER = 3
-"""One pixel in so many is looked at, along diagonals."""
+"""Of the pixels of a held-out picture, one in so many is looked at, along diagonals. Half of the
+error lies on silhouettes, so that parts of many pictures say more than few whole ones: seeds of
+learned occupancy differ by 0.36 dB in four pictures and by 0.24 in sixteen."""
 FEWEST_VIEWS = 2
 """Training pictures that show a surface for it to count: one alone does not tell its depth."""
 RAYS_AT_ONCE = 256
-"""Few: on a CPU 1024 took two to four times as long as 342."""
+"""Few: on a CPU one of 1024 took two to four times as long as one of 342, most of it for memory."""
 
 
 @dataclass(frozen=True)
@@ -155,9 +158,13 @@ def raster(height: int, width: int) -> Tensor:
 
 
 def count_lost(nearest: Tensor, depth: Tensor, shown_by: Tensor) -> tuple[int, int]:
-    """How many rays lose the surface that they meet, and how many meet one that counts: of [N]
-    distances of it from the nearest sample, and from the camera, and the training pictures that
-    show it."""
+    """How many rays lose the surface that they meet, and how many meet one that counts.
+
+    Args:
+        nearest: [N] distance of the surface from the middle of the nearest sample.
+        depth: [N] distance of the surface, in the same units.
+        shown_by: [N] training pictures that show it; 0 where there is none.
+    """
     counts = shown_by >= FEWEST_VIEWS
     kept = nearest[counts] <= NEAR * depth[counts]  # not where a sample is nowhere
     return int((~kept).sum()), int(counts.sum())

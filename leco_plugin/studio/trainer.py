@@ -264,7 +264,7 @@ class AtomicTrainer(Trainer):
         try:
             super().save_checkpoint(step)
             unfinished = beside / f"step-{step:09d}.ckpt"
-            with unfinished.open("r+b") as file:  # Windows syncs no file that is only read
+            with unfinished.open("rb") as file:
                 os.fsync(file.fileno())
             checkpoints.mkdir(parents=True, exist_ok=True)
             finished = unfinished.replace(checkpoints / unfinished.name)

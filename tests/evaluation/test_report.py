@@ -9,6 +9,7 @@ import platform
 from pathlib import Path
 
 import pytest
+import torch
 
 from leco_plugin.evaluation.report import (
     describe_code,
@@ -24,6 +25,14 @@ def test_the_machine_is_described_without_its_name() -> None:
     assert {"cpu", "cores", "device", "torch"} <= json.loads(text).keys()
     assert "/" not in json.loads(text)["device"]
     assert not platform.node() or platform.node() not in text
+
+
+@pytest.mark.parametrize("vectors", ["AVX2", "AVX512"])
+def test_cores_of_one_name_that_are_not_as_fast_are_told_apart(
+    monkeypatch: pytest.MonkeyPatch, vectors: str
+) -> None:
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: vectors)
+    assert describe_machine()["cpu"].endswith(f" ({vectors})")
 
 
 @pytest.mark.parametrize(

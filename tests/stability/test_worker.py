@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from leco_plugin.chart.contender import Contender, Protocol
+from leco_plugin.chart import worker
+from leco_plugin.chart.contender import Contender, Job, Protocol
+from leco_plugin.chart.runner import JOB, PROGRESS, RESULT
 from leco_plugin.samplers import registry
 from leco_plugin.samplers.base import DenseEstimator
 from leco_plugin.samplers.boxes import nested_boxes
 from leco_plugin.samplers.registry import SamplerSpec
+from leco_plugin.scenes.whole_files import write_json
 from leco_plugin.stability.photographs import YARD, Capture, write_scene
 from leco_plugin.stability.plan import DENSE_LEVELS, SAMPLERS, Sizes, contender_of
 from leco_plugin.stability.verdict import judge
@@ -43,11 +47,18 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_scene(YARD, capture, tmp_path_factory.mktemp("stability") / "yard")
 
 
+@pytest.fixture(autouse=True)
+def nothing_reads_the_input(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker, "die_with_parent", lambda: None)
+
+
 def run(contender: Contender, scene: Path, folder: Path) -> dict[str, Any]:
     folder.mkdir()
-    shown: list[float] = []
-    record = run_cell(contender, 0, scene, Protocol(steps=MICRO.steps), folder, shown.append)
-    assert shown[-1] == 1.0
+    shared = {"data": str(scene), "protocol": asdict(Protocol(steps=MICRO.steps))}
+    write_json(folder / JOB, Job(contender, 0).values | shared)
+    assert worker.main(folder, run_cell) == 0
+    record: dict[str, Any] = json.loads((folder / RESULT).read_text())
+    assert (folder / PROGRESS).read_text() == "1.000"
     assert (folder / "view.png").exists()
     assert record["steps"] == MICRO.steps and 0.0 < record["psnr"] < 60.0
     assert record["curve"] == [] and record["ssim"] is None  # nobody else has looked

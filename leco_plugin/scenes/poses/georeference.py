@@ -124,7 +124,7 @@ def place(
 
 def _is_mirrored(turn: Array, places: Array, up: Array, top: Array | None, width: float) -> bool:
     """Whether a turn [3, 3] to places [N, 3] in a plane, `width` metres off, puts what is up [3]
-    down, and no mean top [3] that points up afterwards tells of cameras that look up."""
+    down. A mean `top` [3] of photographs that then points up says no: those cameras look up."""
     away = places - places.mean(axis=0)
     spread = np.linalg.svd(away, compute_uv=False) / np.sqrt(len(places))
     lies_in_a_plane = spread[1] > width > spread[2]
