@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -49,6 +50,13 @@ class Grown(NamedTuple):
         return float(self.grid["kept_volume"] / self.gate["kept_volume"])
 
 
+@cache
+def built_area(blocks: int) -> float:
+    """Of the city with so many blocks a side, square metres."""
+    config = CityConfig(blocks)
+    return float(City(config).built.sum()) * config.block_size**2
+
+
 def cities(reports: Reports) -> list[Grown]:
     """The cities among the reports, from small to large."""
     found = []
@@ -57,9 +65,8 @@ def cities(reports: Reports) -> list[Grown]:
         if name == blocks or not blocks.isdigit():
             continue
         gate, grid = chosen_of(report)
-        config = CityConfig(int(blocks))
-        area = float(City(config).built.sum()) * config.block_size**2
-        found.append(Grown(int(blocks), name, area, report["scene"]["train_images"], gate, grid))
+        area, images = built_area(int(blocks)), report["scene"]["train_images"]
+        found.append(Grown(int(blocks), name, area, images, gate, grid))
     return sorted(found)
 
 

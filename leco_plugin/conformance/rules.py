@@ -138,7 +138,8 @@ def _place(error: Exception) -> str:
 def left_as_before() -> Iterator[None]:
     """With gradients. torch's gradient mode and random states, also those of all cards, are as
     before afterwards."""
-    cards = range(torch.cuda.device_count())  # `torch.manual_seed` seeds them all
+    # `torch.manual_seed` seeds all; a card that torch cannot use is counted too
+    cards = range(torch.cuda.device_count() if torch.cuda.is_available() else 0)
     with torch.random.fork_rng(cards), torch.enable_grad():
         yield
 

@@ -130,8 +130,8 @@ def heal(
     config: GateLossConfig,
     room: float = math.inf,
 ) -> str:
-    """Heals the gate whose last layer this is, as far as the run has room; returns what was done,
-    in words. Shares are as for `find_collapse`."""
+    """Heals the gate whose last layer this is, for which the run has `room` steps left; returns
+    what was done, in words. `shares` [1 + n] are those of points at each expert."""
     anew = is_restart_due(collapse, config, progress)
     progress.recoveries += 1
     progress.suspected_since = -1
@@ -254,8 +254,8 @@ class StepPlan(NamedTuple):
 def plan_of(
     step: int, config: LecoModelConfig, progress: Progress, learning: bool, frozen: bool
 ) -> StepPlan:
-    """How a step samples and what it teaches, while the occupancy is still learned or the gate is
-    frozen."""
+    """How a step samples and what it teaches: `learning` is whether the occupancy is still learned,
+    `frozen` whether the gate is frozen."""
     ramped = ramp(step - progress.began, schedule_since(config.schedule, progress))
     coarse = learning or ramped < 1.0
     # a homogeneous gate is taught nothing about emptiness

@@ -67,7 +67,8 @@ def leave_file(occupancy: Occupancy, folder: Path | None) -> None:
 
 
 def withdraw_file(folder: Path | None) -> None:
-    """Removes the file of a gate that learns again, so that nobody is guided by it."""
+    """Removes the file of a gate that learns again from its folder, if it has one, so that nobody
+    is guided by it."""
     if folder is None:
         return
     file = folder / FILE_NAME
@@ -78,7 +79,8 @@ def withdraw_file(folder: Path | None) -> None:
 
 
 def leave_field(mixture: Mixture, folder: Path | None) -> None:
-    """Leaves a frozen mixture's state in a folder: about a third of a checkpoint, no optimizer.
+    """Leaves a frozen mixture's state in its folder, if it has one: about a third of a checkpoint,
+    no optimizer.
 
     A disk that is full is said in one line; only `leco shrink` is the poorer for it.
     """

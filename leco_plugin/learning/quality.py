@@ -73,8 +73,8 @@ def doubts_of_field(field: float, one_colour: float) -> list[str]:
 
 
 def doubts_of_occupancy(kept: float) -> list[str]:
-    """Two lines on an occupancy that keeps so large a share of what photographs show; none on one
-    of use."""
+    """Two lines on an occupancy that keeps nearly everything, by the share that it keeps of what
+    photographs show; none on one of use."""
     if kept <= MOST_KEPT:
         return []
     return [

@@ -168,8 +168,8 @@ class Progress:
         self.learning_kept = 0.9 * self.learning_kept + 0.1 * share
 
     def begin(self, configured: int, most: int) -> None:
-        """Sets `learn_steps`, unless a checkpoint did so under the same config: those configured,
-        or as many as this process leaves for the first phase at most, from `since` on."""
+        """Sets `learn_steps`, unless a checkpoint did so under the same config: `configured` steps
+        from `since` on, or `most`, as many as this process leaves for the first phase."""
         if configured != self.configured:
             self.phase = min(configured, most)
             self.learn_steps = self.since + self.phase

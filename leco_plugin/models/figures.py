@@ -74,7 +74,8 @@ def leading_expert(met: Shaded, ray_indices: Tensor, experts: int) -> Tensor:
 
 
 def with_alpha(outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
-    """A colour picture with what was met before the backdrop as its alpha, [..., 4].
+    """A colour picture with what was met before the backdrop as its alpha, [..., 4]; its name
+    contains `rgb`.
 
     Warns where nothing is met at all, for nerfstudio's exporter goes on until it has met enough.
     """

@@ -86,12 +86,14 @@ def test_random_numbers_and_gradients_are_as_before():
         assert not torch.is_grad_enabled()
 
 
-def test_random_numbers_of_all_cards_are_as_before(monkeypatch):
+@pytest.mark.parametrize("usable, cards", [(True, [0, 1]), (False, [])])
+def test_random_numbers_of_all_usable_cards_are_as_before(monkeypatch, usable, cards):
     fork, kept = torch.random.fork_rng, []
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     monkeypatch.setattr(torch.random, "fork_rng", lambda cards: kept.extend(cards) or fork([]))
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: usable)
     assert apply(rule(lambda case: torch.manual_seed(5)), Case()).passed
-    assert kept == [0, 1]
+    assert kept == cards
 
 
 @pytest.mark.gpu

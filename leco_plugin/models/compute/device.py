@@ -96,6 +96,6 @@ def _fields_of(file: Path, *names: str) -> list[int]:
     """Of a file with a name and a number in each line; none where it cannot be read."""
     try:
         rows = [line.split() for line in file.read_text().splitlines()]
-        return [int(row[1]) for row in rows if row[0] in names]
+        return [int(row[1]) for row in rows if row and row[0] in names]
     except (OSError, ValueError, IndexError):
         return []

@@ -198,8 +198,8 @@ def call_along_rays(name: str, rooms: Tensor, *given: Values) -> list[slice]:
 
     Args:
         rooms: [R] int64, where the samples of each ray have room.
-        given: what the structures hold that the routine is given, in the same order; tensors are
-            contiguous.
+        given: what the structures hold that the routine is given, in the same order: `Scene` and
+            `Batch` of front_to_back.c, or `March` of march.c. Tensors are contiguous.
     Returns:
         Where in the tensors of samples those lie that the routine wrote, in the order of the rays.
     """

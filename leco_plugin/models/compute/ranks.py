@@ -18,7 +18,8 @@ T = TypeVar("T")
 
 def is_distributed() -> bool:
     """Whether the run has several processes."""
-    return distributed.is_initialized() and distributed.get_world_size() > 1
+    known = distributed.is_available() and distributed.is_initialized()
+    return known and distributed.get_world_size() > 1
 
 
 def is_first() -> bool:
@@ -45,7 +46,7 @@ def share(tensors: Iterable[Tensor]) -> None:
 
 def from_first(make: Callable[[], T], device: torch.device) -> T:
     """What `make` returns in the first process, plain values; the others wait and do not call it.
-    As below, `device` is that of the process."""
+    `device` is that of this process."""
     if not is_distributed():
         return make()
     made = [make() if is_first() else None]

@@ -147,7 +147,7 @@ def _filled(wanted: Sizes, most: Sizes, detail: SceneDetail | None) -> Sizes:
         encoding,
         finest=finest,
         levels=encoding.levels or _between(2, levels, top.levels),
-        log2_table=encoding.log2_table or _between(FEWEST_ENTRIES, log2_table, top.log2_table),
+        log2_table=encoding.log2_table or min(max(FEWEST_ENTRIES, log2_table), top.log2_table),
     )
     wished = math.ceil(min(texels / TEXELS_PER_EXPERT, largest.scene_experts))
     chosen = _between(1, wished, largest.scene_experts)
