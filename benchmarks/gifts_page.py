@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import checkout  # noqa: F401
 from nerfacc import OccGridEstimator
 from page_parts import ROOT, table
+from rivals import STORED, sweep_lines
 
 from leco_plugin.chart.contender import (
     DENSE,
@@ -52,14 +54,16 @@ learned-occupancy-without-gifts` charts a learned row without them; a stored one
 - **Codes**: small ones begin at zero. Those of nerfstudio cost test views several dB.
 - **Front to back**: images leave out what lies behind opaque surfaces. *guided*: where that is
   faster.
+- **Clock**: all that the process of a run does counts, drawing rays too. Data managers of
+  nerfstudio that draw them in other processes draw them in the run's own.
 - **Loss of colours**: `leco-occupancy` in all its rows weighs errors in hue eight times, each host
   keeps its own loss in all of its rows.
 - **Across methods** only time, photographs, threads and codes are equal. Fields, losses, batches
   and bounds are each method's own; LeCO also renders in C, and has the largest table. What a gate
   gains is seen between rows of one method.
 
-No sweep of the rivals' rates and sizes is stored: they have nerfstudio's rates, and sizes that a
-step on a CPU can pay.
+All have nerfstudio's rates, and sizes that a step on a CPU can pay. [Swept](#the-rivals-swept) are
+those of the rivals, ours are not.
 
 This page is generated: `python benchmarks/reference_pages.py`.
 """
@@ -85,6 +89,8 @@ def page(rows: Sequence[Contender] | None = None) -> str:
         head = " | ".join(["row", *next(iter(given.values()))])
         learned = [name for name, one in zip(names, group) if one.sampler.startswith(LEARNED)]
         parts += [f"## `{method}`\n", *table(head, cells), "", *missing(given, learned)]
+    if rows is None:
+        parts += ["## The rivals, swept\n", *sweep_lines(json.loads(STORED.read_text()))]
     return "\n".join(parts).rstrip() + "\n"
 
 
