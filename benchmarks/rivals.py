@@ -127,7 +127,9 @@ def sweep_lines(results: dict[str, Any]) -> list[str]:
         psnrs.setdefault(run["name"], []).append(run["psnr"])
     rows = []
     for given, others in swept():
-        base = psnrs[given.name]
+        base = psnrs.get(given.name)
+        if base is None:
+            continue
         rows.append([f"**{given.name}**", f"{fmean(base):.1f} dB", "as in all charts"])
         for one in others:
             if found := psnrs.get(one.name):
