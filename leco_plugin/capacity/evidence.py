@@ -38,7 +38,8 @@ class Evidence(NamedTuple):
     kept: Tensor
     """[M] bool, by the original."""
     weights: Tensor
-    """[M] rendering weights, zero where the original skips; o(x) where there is no model."""
+    """[M] rendering weights under the original's guidance, zero where it skips; o(x) where there is
+    no model."""
     worth: Tensor
     """[M] the same near surfaces, zero elsewhere: lost surface mass is counted in it."""
     rays: int

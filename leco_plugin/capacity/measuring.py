@@ -56,7 +56,8 @@ FIELD = "field.pt"
 RAYS, TAUGHT_RAYS = 8192, 1 << 15
 VOLUME_POINTS = 1 << 17
 STEPS = 3000
-"""Of teaching: after 300, small gates keep two to nine times what they keep after 1000."""
+"""With which each gate is taught. After 300 small ones still keep two to nine times what they keep
+after 1000 (docs/decisions.md)."""
 
 
 class Taught(NamedTuple):
@@ -69,7 +70,8 @@ class Taught(NamedTuple):
     mapped: Tensor
     """[M, 3] of those candidates, in [-1, 1]."""
     volume: Tensor
-    """[P, 3] mapped, spread evenly over what rays reach of the scene's box."""
+    """[P, 3] mapped, spread evenly over the part of the scene's box that rays reach. Elsewhere
+    nothing is taught."""
 
 
 def prepare(data: Path, folder: Path, learn_steps: int) -> Taught:

@@ -134,9 +134,11 @@ def name_of(config: GateConfig) -> str:
 
 
 STEPS, LONGER, NEARLY = 3000, 3, 3.0
-"""Steps of teaching; `LONGER` times as many for a loss of at most `NEARLY` times the limit."""
+"""Steps of teaching. A gate whose loss is at most `NEARLY` times what the search allows is taught
+again, `LONGER` times as long."""
 EMPHASIS, WEIGHT_AT_FULL = 8.0, 0.05
-"""How much more a candidate with at least this rendering weight counts."""
+"""How much more a candidate with rendering weight counts, and the weight from which on it does so
+fully."""
 MARGIN = 0.5
 """Share of the allowed loss that a gate may use on the rays of the search, so that others hold."""
 VOLUME_POINTS = 1 << 17

@@ -42,7 +42,7 @@ class Contender:
     taught: bool = False
     """Whether its field teaches small gates that are compared with its gate."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of the whole method, by their path."""
+    """Settings of the whole method, by their path; keys of dictionaries are steps of it too."""
 
     @property
     def key(self) -> str:
@@ -274,7 +274,8 @@ class Cores:
     grids: float
     """Making grids up to 512^3 from a field, and teaching small gates by it."""
     megapixel: float
-    """Rendering a million pixels by a run that skips; others take `UNGUIDED` times as long."""
+    """Rendering a million pixels by a run that skips; one that does not takes `UNGUIDED` times as
+    long."""
 
 
 SMALL, UNGUIDED = 480 * 360 / 1e6, 5.0

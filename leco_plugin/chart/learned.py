@@ -147,7 +147,7 @@ ENOUGH = 0.3
 HARDLY_TRAINED = 0.4
 """Share of its time from which on updates of a grid have left no time to train."""
 FALL = 0.3
-"""dB below its own best point from which on a run has fallen."""
+"""dB below the best point of a run's own curve from which on its end is said to have fallen."""
 
 
 def last_gain(line: Line) -> float | None:

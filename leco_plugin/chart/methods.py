@@ -43,7 +43,8 @@ NO_GIFTS = {
     "occupancy.learning.termination": 0.0,
     "occupancy.learning.calibration.recheck_rays": 0,
 }
-"""No opaque and careful start, and no distances of sparse points: a grid is given none."""
+"""Take from a learned occupancy what no grid is given: the opaque and the careful start, and the
+distances of sparse points."""
 SKIPPING_NOTHING = {"schedule.freeze": False, "front_to_back": True}
 """Never frozen; rendered front to back, as guided images are."""
 NEVER_FROZEN = Contender("LeCO, never frozen", "leco-occupancy", DENSE, SKIPPING_NOTHING)
@@ -235,11 +236,12 @@ SCENE_LAYERS = LEARNING.sizes.field.experts.layers
 SWITCH_CELLS = switch_nerf_host.sizes.grid_resolution
 """Cells of Switch-NeRF's own grid."""
 GRIDS = (128, 256, 512) if ON_GPU else (64, 128, 256)
-"""Cells along an axis; 512^3 takes two CPU cores all of a run."""
+"""Cells along an axis, updated while the host trains; 512^3 takes two CPU cores all of a run."""
 MADE_GRIDS = (64, 128, 256, 512)
-"""Made from one field, each from the one before."""
+"""Made from one field, each from the one before, which costs less than updates in training."""
 STEPS = 2 * LEARNING.schedule.learn_steps
-"""Of suites that ask what was learned: half or, for a slow gate, three quarters for learning."""
+"""Of suites that ask what was learned: half for learning, and a quarter more for a gate that has
+not settled."""
 AT_ONCE = 1 if ON_GPU else min(2, usable_cores())
 """Runs at a time: on a CPU, small tensors gain more by another run than by another thread."""
 ALL = "all"

@@ -99,7 +99,8 @@ class Shown:
     costs: list[Panel]
     """PSNR against each cost."""
     space: list[Panel]
-    """Space kept at equal loss, against size and learning time or against PSNR."""
+    """Space kept at equal loss, where the chart is about that: against size and learning time, or
+    against PSNR."""
 
 
 def shown_of(results: Mapping[str, Any]) -> Shown:

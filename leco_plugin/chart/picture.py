@@ -45,7 +45,7 @@ TITLE_WIDTH, TEXT_WIDTH = 66, 104
 CHARACTER = 0.0098
 """Width of a letter, as a share of the figure's."""
 TOP, LINE_HEIGHT, SMALL_LINE_HEIGHT = 0.985, 0.04, 0.0235
-"""Shares of the figure's height."""
+"""Top of the title, and line heights of it and of the text below, shares of the figure's height."""
 COSTS_BELOW = "What it costs. Up and left is better; nothing is better in both than the grey line."
 PSNR_BELOW = "PSNR on unseen photographs, dB, against what it costs. Up and left is better:"
 KEPT_SPACE = f"Space that must be sampled where each loses {LOST_SURFACE_MASS:.1%} of the surface"
@@ -263,7 +263,7 @@ FAR = 0.1
 """Share of the panel's size from which on a line leads from a point to its name."""
 ACROSS = (0.022, 0.07, 0.12, 0.17, 0.22)
 UP = (0.06, 0.0, 0.13, 0.2, 0.27, 0.34, 0.41)
-"""Distances that are tried, shares of the panel's width and height."""
+"""Distances that are tried, from near to far, as shares of the panel's width and height."""
 MARGIN = 1.15
 """Height that is left free for a name, as a multiple of its own."""
 POINT = (0.012, 0.03)

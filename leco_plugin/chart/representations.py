@@ -15,9 +15,9 @@ OUR_KIND = "MLP"
 SMALL_OURS = "small MLP (ours)"
 """The small gate of that kind, which the trained field taught."""
 SPARSE = "sparse points"
-"""What is near one of the scene's. In tables only: it mostly keeps far more."""
+"""What is near one of the scene's is kept. In tables, not in pictures: it mostly keeps far more."""
 BYTES_A_NUMBER = 2
-"""In bfloat16."""
+"""In bfloat16, in which gates are asked on a CPU."""
 COSTS = {"size": "size", "learning time": "learn_seconds"}
 """Costs of fronts, and the figure of each in `Held`."""
 AS_CHEAP = {"size": "as small", "learning time": "learned as soon"}

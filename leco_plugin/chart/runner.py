@@ -34,7 +34,7 @@ RUNS, UNFINISHED, LOGS = "runs", "unfinished", "logs"
 JOB, RESULT, FAILURE, PROGRESS = "job.json", "result.json", "failure.json", "progress"
 """Files in the folder of a job that is under way."""
 KEPT = ("occupancy.safetensors", "view.png")
-"""Files of a job that are kept beside its record, under its name."""
+"""Files of a job that are kept beside its record, under its name and their ending."""
 DAMAGED = "is damaged, or not of a chart; delete it, or name a new folder"
 POLL_SECONDS = 0.25
 

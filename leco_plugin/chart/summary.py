@@ -18,7 +18,8 @@ from leco_plugin.evaluation.report import describe_cores
 CONFIDENCE = 0.95
 """Of the interval around a difference of means; of each comparison alone, however many are made."""
 CLOSE, CLOSE_SHARE = 0.5, 0.25
-"""The widest margin with which two are level: dB, or a share of the means of other figures."""
+"""The widest margin with which two are level: dB, or of other figures a share of their means. With
+a wider one the seeds do not decide."""
 
 
 @dataclass(frozen=True)
@@ -328,7 +329,7 @@ class Versus:
     theirs: str
     psnr: Verdict
     passed: tuple[float | None, ...]
-    """Seconds of training after which it passes the other's mean last PSNR."""
+    """Seconds of training, learning included, after which it passes the other's mean last PSNR."""
     sooner: tuple[float | None, ...]
     """The other's median training time as a multiple of those seconds."""
     faster: tuple[float, ...]

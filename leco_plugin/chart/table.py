@@ -44,7 +44,7 @@ QUALITIES = {
     "FLIP": ("flip", ".3f"),
     "LPIPS": ("lpips", ".3f"),
 }
-"""Title, key in a run and form."""
+"""Title, key in a run and form of figures that are left out where no run has them."""
 ASKED = (
     Cost("field_queries_per_ray", "field, a ray", ""),
     Cost("proposal_queries_per_ray", "proposals, a ray", ""),

@@ -18,8 +18,7 @@ if TYPE_CHECKING:
 
     from leco_plugin.chart.contender import Contender, Protocol
 
-    Show = Callable[[float], None]
-    Make = Callable[[Contender, int, Path, Protocol, Path, Show], dict[str, Any]]
+    Make = Callable[[Contender, int, Path, Protocol, Path, Callable[[float], None]], dict[str, Any]]
     """Makes a run of a seed on a scene, and leaves its files in a folder, as `run_job`."""
 
 WORKER = (sys.executable, "-W", "ignore", "-m", "leco_plugin.chart.worker")
@@ -29,9 +28,9 @@ SMALL_GATES = {
     "TensoRF planes": "vm-32-4",
     "K-planes": "k-planes-32-4-1",
 }
-"""Gates that keep little for their bytes in `leco capacity`."""
+"""A gate of each kind that keeps little for its bytes in `leco capacity`: 5 to 27 kB."""
 TAUGHT_GRIDS = (32, 64, 128, 256)
-"""Cells along an axis."""
+"""Cells along an axis of grids that are taught as small gates are."""
 BYTES_A_POINT = 6
 
 

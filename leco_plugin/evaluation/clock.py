@@ -83,7 +83,7 @@ class Budget:
     seconds: float | None = None
     steps: int | None = None
     learn_seconds: float | None = None
-    """Limit, about, for learning an occupancy."""
+    """Limit, about, for learning an occupancy; None leaves it to the method."""
 
     def __post_init__(self) -> None:
         if self.seconds is None and self.steps is None:
@@ -100,8 +100,11 @@ class Budget:
 
 
 def peak_process_bytes() -> int:
-    """Highest resident memory of this process: the kernel's mark, for `getrusage` starts with the
-    peak of the parent."""
+    """Highest resident memory of this process so far.
+
+    The kernel's own mark where there is one: `getrusage` starts with the peak of the process that
+    started this one.
+    """
     try:
         for line in STATUS.read_text().splitlines():
             if line.startswith("VmHWM:"):

@@ -40,11 +40,11 @@ from leco_plugin.scenes.learning_data import held_out_rays
 
 CALIBRATION = CalibrationConfig()
 LOST_SURFACE_MASS = 1e-3
-"""Share of the weight near surfaces."""
+"""Share of the weight near surfaces that each representation loses."""
 VOLUME_POINTS = 1 << 17
 """Positions drawn in the whole box, of which rays reach some."""
 TAUGHT_RAYS = 1 << 15
-"""Rays of photographs that say what is reached."""
+"""Rays of photographs that say what is reached, and of whose densities grids hear."""
 CELLS = 64
 """Along an axis of the mapped cube: a cell is reached if it holds a candidate of those rays."""
 MOST_ON_CPU = 2e8
@@ -258,7 +258,7 @@ FROM_REPORT = (
 )
 MOST_SURFACE_POINTS = 100_000
 AIR_POINTS = 50_000
-"""Positions drawn over the city, matter included."""
+"""Positions drawn over the city; those in or near matter are then left out."""
 
 
 def truth_of(folder: Path, manager: Any) -> CityTruth | None:

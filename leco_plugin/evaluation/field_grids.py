@@ -1,5 +1,8 @@
-"""Occupancy grids of a trained field, each refined from one half as fine, which has ruled out
-cells: the time for 512^3 depends on how much surface they hold."""
+"""Occupancy grids of a trained field, each refined from one half as fine.
+
+Densities are evaluated only in cells that the coarser grid, or a neighbour there, has not ruled
+out. The time for 512^3 cells therefore depends on how much surface they hold.
+"""
 
 from __future__ import annotations
 
@@ -19,10 +22,11 @@ from leco_plugin.occupancy import gate_precision
 from leco_plugin.samplers.boxes import cells_of
 
 FEWEST_PROBES, PROBES_ALONG = 8, 2048
-"""Densities evaluated at random places of a cell; more in coarse cells."""
+"""Densities evaluated at random places of a cell; the largest is its score. More in coarse cells,
+of which a surface may fill a corner."""
 CELLS_AT_ONCE = 1 << 18
 BYTES_A_CELL = 16
-"""Of memory."""
+"""Of memory while a grid is filled, about."""
 ASK_ALL = 64
 """Cells along an axis up to which a grid may be filled without a coarser one."""
 

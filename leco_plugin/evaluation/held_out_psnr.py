@@ -20,7 +20,7 @@ from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler
 from leco_plugin.studio.host_models import true_colours
 
 FIRST_AFTER, BETWEEN = 8.0, 10.0
-"""Seconds before the first measurement, and between two."""
+"""Seconds before PSNR is measured first, and the fewest between two measurements."""
 SHARE_OF_TIME = 0.01
 """Of the time so far that all measurements may take; the first and the last may exceed it."""
 OLD, SHARE_WHEN_OLD = 30.0, 0.03

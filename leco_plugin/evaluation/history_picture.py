@@ -31,12 +31,12 @@ STILL, MOST_FRAMES = 4, 12
 FRAME_PIXELS = 300
 """Along the longer side of a slice."""
 FRAME_COLOURS = 255
-"""Of a picture that moves."""
+"""Of a picture that moves, the same in all its frames; GIF keeps one more for what stays."""
 FRAME, LAST_FRAME = 250, 3000
 """Milliseconds for which a frame is shown."""
 DPI = 80
 OPAQUE = 1e4
-"""Density, per half extent, that is drawn for more."""
+"""Density, per half extent, that is drawn for more: opaque within a ten-thousandth."""
 
 
 def draw_history(occupancy: Occupancy, folder: Path, path: Path) -> Path:

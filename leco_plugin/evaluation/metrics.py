@@ -1,5 +1,8 @@
-"""PSNR, SSIM, FLIP and LPIPS of one rendered image; the last two, if missing, are left out with one
-warning that says what to do."""
+"""PSNR, SSIM, FLIP and LPIPS of one rendered image.
+
+FLIP and LPIPS are loaded at their first use and are never fetched: on a machine without the package
+of the one or the weights of the other it is left out, with one warning that says what to do.
+"""
 
 from __future__ import annotations
 

@@ -33,12 +33,13 @@ CELLS = 128
 PIXELS = 640
 """Along the longer side of a slice."""
 DPI = 160
-"""Pixels an inch."""
+"""Pixels an inch of a picture, so that its letters can be read at the width of a page."""
 MOST_POINTS = 50_000
 HORIZONTAL = (0.12, 0.4)
-"""Heights of horizontal slices, as shares of the way from the ground to the highest roofs."""
+"""Heights of the horizontal slices, as shares of the way from the ground to the highest roofs:
+those of a history, and of a picture where no two heights differ."""
 LAYERS, LAYER_CELLS = 24, 96
-"""Heights that are compared, and cells along the longest side."""
+"""Heights that are compared for the slices of a picture, and cells along the longest side."""
 FLAT = 0.25
 """Height of a slice, in widths, up to which heights are drawn longer."""
 TYPE = 10.0

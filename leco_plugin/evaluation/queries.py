@@ -98,7 +98,7 @@ def number_of(positions: Any) -> int:
 
 
 WARM_UP = 1 / 16
-"""Most of a run that the warm-up of a grid lasts."""
+"""Most of a run that the warm-up of a grid lasts: nerfacc's 256 steps are half of a short run."""
 
 
 class GridUpdates:

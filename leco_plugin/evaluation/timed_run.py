@@ -59,19 +59,19 @@ class TimedRun:
     step_seconds: float | None = None
     """Median of a step, once there is an occupancy if ever."""
     learn_seconds: float | None = None
-    """Until there was an occupancy, or of all updates of a grid."""
+    """Of the training time: until there was an occupancy, or all updates of a grid."""
     freeze_seconds: float | None = None
     """When there was an occupancy."""
     at_freezing: dict[str, Any] | None = None
-    """`PRICES` of its report then: a host may skip less later on."""
+    """What it cost and saved then, `PRICES` of its report: a host may skip less later on."""
     recoveries: int | None = None
-    """How often a collapsed gate was healed, if it learned one."""
+    """How often a collapsed gate was healed; None where a model learns none itself."""
     warming_up: bool | None = None
     """Whether the run ended in the warm-up of a grid, in which all cells are asked."""
     psnr: float = math.nan
-    """Of the pixels of all test images together."""
+    """Of the pixels of all test images together, as the last point of the curve."""
     image_psnr: float | None = None
-    """Mean over test images of the PSNR of each on the same pixels."""
+    """Mean over test images of the PSNR of each, as ns-eval averages it, on the same pixels."""
     ssim: float = math.nan
     flip: float | None = None
     lpips: float | None = None

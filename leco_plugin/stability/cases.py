@@ -31,7 +31,8 @@ class Case:
     grid_levels: int = 1
     """Nested boxes of occupancy grids: as many as somebody who knows the scene would take."""
     fine_grid: bool = False
-    """Whether the size of cells is the question, so that 256^3 are tried too."""
+    """Whether the size of cells is the question, so that 256^3 are tried too. To keep these up to
+    date takes a core of a CPU minutes."""
     only: tuple[str, ...] = ()
     """Samplers that it has something to say about, besides references; none is all."""
     seeds: int = 1

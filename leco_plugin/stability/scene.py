@@ -21,7 +21,7 @@ _SUN = np.array([0.48, -0.36, 0.8])
 _SHADE = 0.45
 """Light where the sun does not reach."""
 _QUINCUNX = ((0.5, 0.5), (0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75))
-"""Places in a pixel that rays go through; the first gives the depth."""
+"""Places in a pixel that rays go through. The first gives the depth, all give the colour."""
 _FOG_STEPS = 32
 _HORIZON, _ZENITH = np.array([0.86, 0.90, 0.94]), np.array([0.35, 0.55, 0.86])
 

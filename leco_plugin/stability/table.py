@@ -25,7 +25,7 @@ SIGNS = {"pass": "pass", "degraded": "degraded", "fail": "**fail**", "no referen
 ROW, HEAD, FOOT = 0.34, 1.15, 0.75
 """Heights in inches."""
 NAMES, COLUMN = 2.45, 1.88
-"""Widths in inches."""
+"""Widths in inches: type of 10 points is to be read where a page shows all of it."""
 GAP = 0.03
 VIEW = 3.4
 """Width of one picture of a failure, inches."""

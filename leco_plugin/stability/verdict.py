@@ -27,7 +27,8 @@ class Bars:
     detail: float
     """As `below_reference`, on the pixels that the case is about."""
     lost_mass: float
-    """Share of rays whose surface is not sampled, above the reference's."""
+    """Share of the rays whose surface is not sampled, above the reference's. No occupancy is exact
+    to a pixel at the edges of things."""
 
 
 PASS, DEGRADED = Bars(0.2, 0.5, 0.5, 0.01), Bars(1.0, 1.5, 2.0, 0.05)

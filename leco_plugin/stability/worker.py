@@ -56,7 +56,8 @@ class Measured:
     psnr: float
     """Of all that is looked at."""
     lost_mass: float | None
-    """Share of rays without a sample near a surface that `FEWEST_VIEWS` show; None without such."""
+    """Of the rays that meet a surface which `FEWEST_VIEWS` show, the share without a sample near
+    it; None without such surfaces."""
     kept_fraction: float
     """Samples as a share of the candidates of the dense reference."""
     detail_psnr: float | None
