@@ -46,7 +46,7 @@ class Header(NamedTuple):
     """What a file of an image says before it is decoded."""
 
     size: tuple[int, int]
-    """Width and height of what is stored."""
+    """Width and height of what is stored; of a TIFF, which Pillow sets upright, of what it decodes."""
     mode: str
     """Pillow's."""
     transparent: bool
@@ -74,8 +74,8 @@ def header_of(path: Path) -> Header:
         with opened(path) as image:
             several = image.format != "MPO" and getattr(image, "n_frames", 1) > 1
             transparent = image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info
-            turned, kind = _orientation(image), image.format or ""
-            return Header(image.size, image.mode, transparent, turned, several, kind)
+            size, turned = _size_and_orientation(image)
+            return Header(size, image.mode, transparent, turned, several, image.format or "")
     except Image.DecompressionBombError:
         most = f"{2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f} megapixels that Pillow opens"
         raise InputError(f"{path} has more than the {most}: make it smaller") from None
@@ -83,6 +83,16 @@ def header_of(path: Path) -> Header:
         if not path.exists():
             raise InputError(f"the image {path} is not there{remedy_for_missing(path)}") from None
         raise InputError(f"{path} cannot be read as an image: {SAVE_ANEW}") from None
+
+
+def _size_and_orientation(image: Image.Image) -> tuple[tuple[int, int], int]:
+    """Of a TIFF those of what Pillow decodes: it sets it upright, as nerfstudio then gets it."""
+    size, orientation = image.size, _orientation(image)
+    if image.format != "TIFF":
+        return size, orientation
+    if orientation >= 5 and size[0] == image.getexif().get(ExifTags.Base.ImageWidth):
+        size = size[::-1]  # releases of Pillow that give the stored size until they decode
+    return size, 1
 
 
 def _orientation(image: Image.Image) -> int:

@@ -306,6 +306,19 @@ def test_what_a_name_says_wrongly_is_written_anew_as_its_name_says(
     assert copies(folder, tmp_path / "out")["IMG_1.jpg"].format == "JPEG"
 
 
+@pytest.mark.parametrize("kind", ["jpg", "tif"])
+def test_the_size_of_a_turned_photograph_is_that_of_its_copy(
+    kind: str, folder: Path, tmp_path: Path
+) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    with Image.open(folder / "IMG_0.jpg") as image:
+        image.save(folder / f"turned.{kind}", exif=exif)
+    found = find_photographs(folder, tmp_path / "out").photographs
+    (turned,) = (each for each in found if each.path.name == f"turned.{kind}")
+    assert turned.size == copies(folder, tmp_path / "out")[turned.name].size == (24, 32)
+
+
 def test_a_picture_larger_than_pillow_opens_is_named_with_its_reason(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
