@@ -26,18 +26,35 @@ def titles() -> dict[str, str]:
         key=lambda name: (_place(others[name], order), name),
     ):
         scene, suite = others[name]["scene"]["name"], others[name]["suite"]
-        found[name] = f"Suite `{suite}` on {scene}" if suite else scene
+        seconds = others[name]["protocol"]["seconds"]
+        time = f", {seconds:g} s" if _is_longer(others[name]) else ""
+        found[name] = f"Suite `{suite}` on {scene}{time}" if suite else scene
     return found
 
 
 def by_scene(suite: str) -> dict[str, tuple[str, dict[str, Any]]]:
     """Name and results of the stored charts of a suite, by scene."""
-    charts = [(name, stored(name)) for name in titles()]
     return {
         results["scene"]["name"]: (name, results)
-        for name, results in charts
-        if results["suite"] == suite
+        for name, results in _of_suite(suite)
+        if not _is_longer(results)
     }
+
+
+def longer(suite: str) -> list[tuple[str, dict[str, Any]]]:
+    """Title and results of the stored charts whose runs had more time than their suite gives."""
+    named = titles()
+    return [(named[name], each) for name, each in _of_suite(suite) if _is_longer(each)]
+
+
+def _of_suite(suite: str) -> list[tuple[str, dict[str, Any]]]:
+    charts = [(name, stored(name)) for name in titles()]
+    return [(name, results) for name, results in charts if results["suite"] == suite]
+
+
+def _is_longer(results: dict[str, Any]) -> bool:
+    given = SUITES[results["suite"]].seconds if results["suite"] in SUITES else None
+    return given is not None and (results["protocol"]["seconds"] or 0.0) > given
 
 
 def _place(results: dict[str, Any], order: list[str]) -> int:

@@ -7,12 +7,13 @@ from typing import Any
 
 import checkout  # noqa: F401
 from answers import in_short, scenes_of
-from chart_sections import by_scene, notes
+from chart_sections import by_scene, longer, notes
 from growth_picture import cities, finding
-from page_parts import size, span
+from page_parts import heading_anchor, size, span
 from sizes_tables import chosen_of
 
-from leco_plugin.chart.learned import still_rising
+from leco_plugin.chart.learned import last_gain, still_rising
+from leco_plugin.chart.panels import finding_of
 from leco_plugin.chart.representations import (
     SMALL_OURS,
     Representation,
@@ -142,11 +143,19 @@ def _freezing(charts: Sequence[Mapping[str, Any]]) -> str:
 def _enough(charts: Sequence[Mapping[str, Any]]) -> str:
     rising = sum("learned occupancy" in still_rising(lines_of(results)) for results in charts)
     seconds = charts[0]["protocol"]["seconds"]
-    return (
+    said = [
         "For equal time see the first table. Enough time is open: Switch-NeRF's runs of "
         f"{seconds:g} s still rise with a learned occupancy on {rising} of {scenes_of(charts)}. "
         f"{in_short(charts)}"
-    )
+    ]
+    for title, results in longer("enough-time"):
+        gained, found = last_gain(lines_of(results)[0]), finding_of(results)
+        said.append(
+            f"After {results['protocol']['seconds']:g} s on `{results['scene']['name']}` "
+            f"{found[0].lower()}{found[1:]}; in the last third it gained {gained:.1f} dB "
+            f"([figures](suites.md#{heading_anchor(title)}))."
+        )
+    return " ".join(said)
 
 
 def _no_empty(charts: Sequence[Mapping[str, Any]]) -> str:

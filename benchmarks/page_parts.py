@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -82,3 +83,8 @@ def section(
 ) -> list[str]:
     """Title, the command and the machine that made the table, and the table."""
     return [f"## {title}\n", f"`{command}`; {machine_line(report)}.{note}\n", f"{table}\n"]
+
+
+def heading_anchor(title: str) -> str:
+    """How a heading is linked to."""
+    return re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")

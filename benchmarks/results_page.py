@@ -9,7 +9,6 @@ python benchmarks/results_page.py
 from __future__ import annotations
 
 import json
-import re
 import sys
 from typing import Any
 
@@ -21,17 +20,27 @@ from eight_questions import eight_answers
 from growth_picture import cities, growth_table
 from large_scene_tables import LARGE_SCENES
 from learning import sentence as learning_sentence
-from page_parts import RESULTS, ROOT, machine_line, made_line, noted, picture, section, table
+from page_parts import (
+    RESULTS,
+    ROOT,
+    heading_anchor,
+    machine_line,
+    made_line,
+    noted,
+    picture,
+    section,
+    table,
+)
 from page_pictures import GROWTH, LEARNING, draw_pictures, is_stale, pictures
 from profile_page import profile_sections
 from readme_parts import (
     GAIN_CHART,
     GIFTS_CHART,
-    HALF_HOUR_CHARTS,
     demo_table,
     gain,
     gains,
     gifts_sentence,
+    half_an_hour,
     readme,
 )
 from sharpening import kept_by_grids, sharpening_sections
@@ -44,7 +53,6 @@ from upstream_page import PAGE as UPSTREAM_PAGE
 from upstream_page import page as upstream_page
 from walk import with_walk
 
-from leco_plugin.chart.learned import last_gain
 from leco_plugin.chart.summary import lines_of
 
 PAGE = ROOT / "docs" / "results.md"
@@ -276,24 +284,6 @@ def new_views() -> str:
     )
 
 
-def half_an_hour() -> str:
-    """What is left of the gain when there is time."""
-    parts = []
-    for place, name in HALF_HOUR_CHARTS.items():
-        ours, other = lines = lines_of(stored(name))
-        ends = [f"{line.psnr:.1f} dB ({last_gain(line):+.1f})" for line in lines]
-        passed = ours.seconds_to(other.psnr)
-        sooner = "" if passed is None else f"; the first had passed the second by {passed:.0f} s"
-        parts.append(
-            f"on {place} {ends[0]} with a learned occupancy, {ends[1]} as *{other.name}*{sooner} "
-            f"([figures](measurements.md#{heading_anchor(titles()[name])}))"
-        )
-    return (
-        "**After half an hour** of one core LeCO has, with one seed each, so without a verdict, "
-        f"{'; '.join(parts)}. In brackets what the last ten minutes brought."
-    )
-
-
 def page() -> str:
     """The whole of `docs/results.md`."""
     demo = json.loads((RESULTS / "demo.json").read_text())
@@ -345,11 +335,6 @@ def measurements_page() -> str:
         note = f" {code_of(report)}, sources {report['code']['sources']}."
         parts += section(title, "python benchmarks/gpu.py", report, gpu_table(report), note)
     return "\n".join(parts)
-
-
-def heading_anchor(title: str) -> str:
-    """How a heading is linked to."""
-    return re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
 
 
 def suites_page() -> str:

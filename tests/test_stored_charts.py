@@ -303,6 +303,34 @@ def test_charts_with_a_title_come_first_and_suites_in_their_order(
     assert sections.titles()["z"] == "Z"
 
 
+def test_runs_of_more_time_than_their_suite_gives_stand_beside_its_answers(
+    store: Store, tmp_path: Path
+) -> None:
+    def of(psnr: float) -> list[dict[str, Any]]:
+        names = "learned occupancy", "long steps, no skipping"
+        rising = [[100.0, psnr - 3.0], [400.0, psnr - 0.5], [600.0, psnr]]
+        return [
+            run(name, seed, psnr=psnr + 0.01 * seed - number, curve=rising)
+            for number, name in enumerate(names)
+            for seed in range(3)
+        ]
+
+    short = {"protocol": {"seconds": 120.0, "steps": None, "at_once": 2}}
+    store("enough-time", "fox", *of(20.0), **short)
+    (tmp_path / "charts" / "fox-enough-time.json").rename(tmp_path / "charts" / "fox.json")
+    store("enough-time", "fox", *of(25.0), protocol={**short["protocol"], "seconds": 600.0})
+    assert sections.by_scene("enough-time")["fox"][0] == "fox"
+    ((title, results),) = sections.longer("enough-time")
+    assert title == "Suite `enough-time` on fox, 600 s"
+    assert results["protocol"]["seconds"] == 600.0
+    answer = eight_answers(REPORTS)[4]
+    assert "Switch-NeRF's runs of 120 s still rise with a learned occupancy on 1 of 1 sc" in answer
+    assert "After 600 s on `fox` learned occ" in answer and "25.0 dB, 1.00" in answer
+    assert "in the last third it gained 0.5 dB" in answer
+    assert "(suites.md#suite-enough-time-on-fox-600-s)" in answer
+    assert f"## {title}" in "\n".join(sections.suite_sections())
+
+
 def test_a_chart_that_belongs_to_no_suite_is_on_the_other_page(store: Store) -> None:
     store(None, "z", run("A"))
     assert "## z" in "\n".join(sections.chart_sections())
