@@ -20,7 +20,8 @@ RESET_PEAK = "5"
 
 
 def seconds_now() -> float:
-    """Of the process, where it works on a CPU in one thread; of the wall's clock elsewhere."""
+    """Seconds of the process if it works on a CPU in one thread: other processes do not lengthen
+    them. Elsewhere seconds of the wall's clock. Only differences mean something."""
     alone = not torch.cuda.is_available() and torch.get_num_threads() == 1
     return time.process_time() if alone else time.perf_counter()
 
@@ -118,8 +119,8 @@ def peak_process_bytes() -> int:
 
 
 def forget_peaks() -> bool:
-    """Makes later peaks those of what follows, what is in use included; returns whether the system
-    can."""
+    """Makes later peaks those of what follows; what is in use now counts. Returns whether the
+    system can do so."""
     gc.collect()
     with suppress(OSError, AttributeError):  # no glibc
         ctypes.CDLL("libc.so.6").malloc_trim(0)  # our models on a CPU keep memory that is free

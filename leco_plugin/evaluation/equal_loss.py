@@ -87,7 +87,7 @@ def at_equal_loss(
     """What the mixture's gate keeps at `LOST_SURFACE_MASS`, and grids made from the same field.
 
     Meant for the moment of freezing: later the field is trained only where the gate keeps. Grids
-    hear of the densities along rays, as a gate does, beside random places.
+    are filled with the densities along rays, as a gate is taught them, and at random places.
 
     Args:
         mixture: whose gate is frozen; it is left as it was.
@@ -96,10 +96,12 @@ def at_equal_loss(
             the scores [n, n, n] of a grid in `mapped_box`.
     Returns:
         `lost_surface_mass`; `reached_volume`, the share of the scene's box that rays reach;
-        `kept_reached_volume` and `kept_candidates`, shares of that and of the candidates; `grids`,
-        the same with `resolution`, `bytes` at one bit a cell, `octree_bytes`, `update_seconds` with
-        those of coarser grids, and whether it keeps least `dilated` by a cell; `others`; and
-        `left_out`, resolutions without memory or time for them.
+        `kept_reached_volume` and `kept_candidates`, shares of that and of the candidates between
+        near and far. `grids` holds the same for each grid, with its `resolution`, its `bytes` at
+        one bit a cell, its `octree_bytes`, whether it keeps least `dilated` by a cell, and the
+        `update_seconds` that it took beyond the field, coarser grids included. `others`, if there
+        are any, holds what each keeps, and for a grid `dilated` and `octree_bytes`. `left_out`
+        lists resolutions that do not fit the free memory, or take minutes of a CPU.
     Raises:
         ValueError: held-out rays see no surface.
     """
@@ -152,7 +154,8 @@ def near_points(points: Tensor) -> Callable[[Tensor], Tensor]:
 def _kept_by_grid(
     weights: Tensor, box: ViewBox, mapped: Tensor, volume: Tensor, scores: Tensor
 ) -> dict[str, Any]:
-    """What a grid of scores [n, n, n] keeps, as it is or dilated, and its bytes as an octree."""
+    """What a grid of scores [n, n, n] keeps, as it is or dilated, whichever keeps less; and its
+    bytes as an octree."""
     both = []
     for dilated, cells in enumerate((scores, dilate(scores))):
         of_rays, of_volume = (look_up_scores(cells, box, places) for places in (mapped, volume))
@@ -169,7 +172,8 @@ def _grids_of(
     mapped: Tensor,
     weights: Tensor,
 ) -> Iterator[tuple[dict[str, Any], Tensor | None]]:
-    """Facts and scores of grids of the field; without scores where there is no memory or time."""
+    """Facts and scores [n, n, n] of grids of the field, which hold its density at the mapped places
+    `taught` [M, 3] too. There are no scores where there is no memory or no time for them."""
     if not resolutions:
         return
     box = mapped_box(mixture)
@@ -190,7 +194,8 @@ def _grids_of(
 def _measured(
     mixture: Mixture, datamanager: Any, config: CalibrationConfig
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Candidates of held-out rays: mapped [M, 3], weights near surfaces [M], and o(x) [M]."""
+    """Candidates of held-out rays before the backdrop: mapped positions [M, 3], weights near
+    surfaces [M], and o(x) [M]."""
     rays, _ = held_out_rays(mixture, datamanager, config.rays)
     pieces = []
     for some in in_chunks(rays, config.rays_at_once):
@@ -210,7 +215,8 @@ def mapped_box(mixture: Mixture) -> ViewBox:
 
 
 def reached_volume(mixture: Mixture, taught: Tensor, count: int, seed: int = 0) -> Tensor:
-    """Mapped positions [P, 3], P <= count, in the cells of candidates `taught` [M, 3]."""
+    """Mapped positions [P, 3], P <= count, spread evenly over what rays reach of the scene's box:
+    the cells of their mapped candidates `taught` [M, 3]."""
     positions = whole_box(mixture.occupancy()).draw(count, seed).to(mixture.device)
     mapped = mixture.region.space.map(positions).clamp(-1.0, 1.0)
     return mapped[is_reached(taught, mapped)]
@@ -229,7 +235,8 @@ def is_reached(taught: Tensor, mapped: Tensor) -> Tensor:
 
 
 def rays_of_photographs(datamanager: Any, count: int, seed: int = 0) -> RayBundle:
-    """Rays anywhere in the training photographs, without random numbers of training."""
+    """Rays anywhere in the training photographs. The pixels and the random numbers of training are
+    not touched."""
     cameras = datamanager.train_dataset.cameras.to("cpu")
     generator = torch.Generator().manual_seed(seed)
     numbers = torch.randint(len(cameras), (count, 1), generator=generator)
@@ -271,8 +278,8 @@ def truth_of(folder: Path, manager: Any) -> CityTruth | None:
 def occupancy_facts(
     occupancy: Occupancy, file: Path, manager: Any, truth: CityTruth | None
 ) -> dict[str, Any]:
-    """Sizes, calibration, and the comparison with the exact scene, which has the same coordinates
-    as the data manager: JSON values, None without one."""
+    """Sizes, calibration, and the comparison with the exact scene, which is None without one: JSON
+    values. The occupancy, of a file, and the truth are in the data manager's coordinates."""
     report = occupancy.report
     measured: dict[str, Any] = {"kept_surface_recall": None, "free_space_skipped": None}
     if truth is not None:
@@ -293,10 +300,12 @@ def compare_with_truth(
     Args:
         truth: the city in the model's coordinates.
         aabb: [6] the box in which rays are marched, scene units; far walls are no limit.
-        step_size, highest: of marching; z of the highest camera, scene units.
+        step_size: of marching, scene units.
+        highest: z of the highest camera, scene units.
     Returns:
         `kept_surface_recall`: share of the surface points in the middle of the test pixels that
-        are kept; `free_space_skipped`: share of `free_points` that are skipped; or None.
+        are kept; `free_space_skipped`: share of `free_points` that are skipped. Each is None where
+        there is no such point.
     """
     surface = truth.visible_surface("test")
     order = torch.randperm(len(surface), generator=torch.Generator().manual_seed(0))

@@ -38,8 +38,8 @@ class FieldGrids:
     """Grids of one field in a box of mapped coordinates, from coarse to fine.
 
     Args:
-        known: mapped positions [M, 3] and densities [M] that count too: random places miss a
-            surface that fills a thousandth of a cell.
+        known: mapped positions [M, 3] and densities [M] that count too: hundreds of random places
+            miss a surface that fills a thousandth of a cell.
         floor_of: gives, for the scores [n, n, n] of a grid, the score below which a cell and
             its neighbours are empty in finer grids too.
         most: densities that may be evaluated for one grid.
@@ -61,8 +61,8 @@ class FieldGrids:
         """The time of the last grid, including those that it was refined from."""
 
     def fill(self, cells: int) -> Tensor | None:
-        """Scores [n, n, n] of a grid, refined from the one before if that is half as fine; None
-        where it would ask more than `most`."""
+        """Scores [n, n, n] of a grid with n = `cells` along each axis; None where it would ask more
+        than `most`. The grid filled before is refined if it is half as fine."""
         steps = halvings(cells, 0 if self.scores is None else len(self.scores))
         if self.scores is None or 2 * len(self.scores) != steps[0]:
             self.scores, self.floor, self.clock = None, 0.0, Clock()
@@ -79,7 +79,8 @@ class FieldGrids:
 
 
 def halvings(cells: int, known: int) -> list[int]:
-    """Cells along an axis of the grids to fill on the way from the known one, coarse to fine."""
+    """Cells along an axis of the grids to fill on the way to one, from the known grid on, coarse to
+    fine."""
     steps = [cells]
     while steps[0] > ASK_ALL and steps[0] % 2 == 0 and steps[0] != 2 * known:
         steps.insert(0, steps[0] // 2)
@@ -92,8 +93,9 @@ def cells_to_ask(
     floor: float = 0.0,
     device: torch.device | str = "cpu",
 ) -> Tensor:
-    """Cells not known to be empty: bool [n, n, n]. One is known so where the scores of a grid half
-    as fine are all below `floor` around it."""
+    """Cells whose density is to be asked: bool [n, n, n]. Without scores of a grid half as fine,
+    that is every cell. Otherwise a cell is empty where those of it and all around are below
+    `floor`."""
     if coarser is None:
         return torch.ones((cells,) * 3, dtype=torch.bool, device=device)
     near = dilate(coarser) >= floor
@@ -101,13 +103,15 @@ def cells_to_ask(
 
 
 def probes_in_a_cell(cells: int) -> int:
+    """Random places at which each cell is asked, of a grid with so many along an axis."""
     return max(FEWEST_PROBES, PROBES_ALONG // cells)
 
 
 def fill_cells(
     density: Density, box: ViewBox, asked: Tensor, known: tuple[Tensor, Tensor] | None = None
 ) -> Tensor:
-    """Scores [nx, ny, nz] of cells, zero where they are neither asked nor known."""
+    """Scores [nx, ny, nz] of cells, zero where they are neither asked, bool [nx, ny, nz], nor
+    known: mapped positions [M, 3] and densities [M]."""
     device = box.low.device
     scores = torch.zeros(asked.shape, device=device)
     counts = torch.tensor(asked.shape, device=device)
@@ -131,7 +135,8 @@ def largest_in_cells(scores: Tensor, box: ViewBox, mapped: Tensor, values: Tenso
 
 
 def dilate(scores: Tensor) -> Tensor:
-    """Each cell with the score of its largest neighbour: a gate is taught a margin too."""
+    """Each cell with the score of its largest neighbour: [nx, ny, nz]. Random places in a small
+    cell miss what is dense there, and a gate is taught a margin too."""
     return max_pool3d(scores[None, None], 3, stride=1, padding=1)[0, 0]
 
 

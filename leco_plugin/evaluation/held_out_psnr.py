@@ -26,15 +26,17 @@ SHARE_OF_TIME = 0.01
 OLD, SHARE_WHEN_OLD = 30.0, 0.03
 """Seconds after which PSNR is measured again where that takes at most so much of them."""
 RAYS, FEWEST_LAST, MOST_LAST = 256, 1024, 8192
-"""Rays of a measurement; fewest and most of the last."""
+"""Rays of a measurement; the fewest and the most of the last one."""
 OF = "on held-out pixels"
 TEST_PHOTOGRAPHS = 8
 """That are looked at when a run is over."""
 
 
 class HeldOutPsnr:
-    """Measures the PSNR of nerfstudio's model on pixels that no step trains on, the same but for
-    the last time. The model is trained exactly as it would be without.
+    """Measures the PSNR of nerfstudio's model on pixels of its training photographs that no step
+    trains on. The model is trained exactly as it would be without.
+
+    All measurements but the last are of the same pixels.
 
     Attributes:
         latest: dB, None until it was measured.
@@ -76,8 +78,11 @@ class HeldOutPsnr:
         return self._measure(max(FEWEST_LAST, min(affordable, MOST_LAST)))
 
     def _measure(self, count: int) -> int:
-        """Measures on up to so many pixels; returns how many. One ray comes before the clock
-        starts: a changed occupancy makes the model build a sampler, in seconds."""
+        """Measures on so many pixels, or as many as there are; returns how many.
+
+        One ray comes before the clock starts: after a change of the occupancy it makes the model
+        build the sampler that the next step needs as well, which takes seconds.
+        """
         began = time.monotonic()
         if self.pixels is None or count != RAYS:  # of so many, the same are drawn once
             self.pixels = held_out_bundle(self.manager, count, share="all")
@@ -96,7 +101,8 @@ class HeldOutPsnr:
 
     @torch.no_grad()
     def _psnr_of(self, pixels: list[tuple[RayBundle, Tensor]]) -> float:
-        """PSNR of rendered rays, by chunks with true colours [R, 3 or 4]; notes `of_one_colour`."""
+        """PSNR, dB, of rendered rays, in chunks with true colours [R, 3 or 4]; sets
+        `of_one_colour`."""
         device = self.model.device
         devices = [device] if torch.device(device).type == "cuda" else []
         with torch.random.fork_rng(devices), evaluating(self.model):
@@ -113,8 +119,11 @@ class HeldOutPsnr:
         return "" if self.latest is None else f"{self.latest:.1f} dB {OF}"
 
     def look_at_tests(self) -> float | None:
-        """PSNR on pixels of up to `TEST_PHOTOGRAPHS` test photographs, which are new views; None
-        without any. From now on `of_one_colour` is of them."""
+        """PSNR, dB, on pixels of up to `TEST_PHOTOGRAPHS` test photographs; None without any. From
+        now on `of_one_colour` is of these pixels.
+
+        They are new views: a field can be good on photographs that it was trained on and fail here.
+        """
         dataset: Any = getattr(self.manager, "eval_dataset", None)
         if dataset is None or len(dataset) == 0:
             return None

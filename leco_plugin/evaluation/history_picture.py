@@ -71,6 +71,7 @@ def write_film(
     """Writes a GIF that repeats. All frames share one palette, so that a colour never changes.
 
     Args:
+        frames: RGB pictures of one size.
         durations: in milliseconds, of all frames or of each.
         colours: in the palette. There is no dither, which GIF cannot compress.
     """
@@ -114,6 +115,7 @@ class _Film:
         low, high = heights_seen_from_above(occupancy, self.box)
         middle = middle_of(surface_points(occupancy, self.box, low)[0], self.box)
         self.places = ((2, low + HORIZONTAL[0] * (high - low)), (1, float(middle[1])))
+        """The axis that each slice is normal to, and its position along that, scene units."""
         self.shares = torch.stack(history.shares).numpy()
         self.densities = torch.stack(history.densities).clamp(max=OPAQUE).numpy()
 

@@ -97,7 +97,8 @@ def describe(occupancy: Occupancy) -> dict[str, Any]:
 
 
 def doubts(facts: dict[str, Any]) -> list[str]:
-    """What was said of a useless occupancy or field; `facts` are of `describe`."""
+    """What a run says at its end, or at freezing, of a field or an occupancy that is of no use;
+    `facts` are of `describe`."""
     found: list[str] = []
     report = facts["report"]
     at_end = report.get(AT_END)
@@ -124,7 +125,8 @@ def whole_box(occupancy: Occupancy) -> ViewBox:
 
 
 def mapped_box(occupancy: Occupancy) -> ViewBox:
-    """The part of the gate's cube in which it was taught, on the CPU."""
+    """The part of the gate's cube in which it was taught, on the CPU; all of it where the scene is
+    unbounded."""
     if occupancy.space.kind != "box":
         return ViewBox(-torch.ones(3), torch.ones(3))
     box = whole_box(occupancy)
@@ -168,7 +170,8 @@ def scene_of(occupancy: Occupancy, file: Path, data: Path | None) -> Path | None
 
 
 def to_the_data(occupancy: Occupancy) -> Tensor | None:
-    """From positions of the run to those of the data's files: [3, 4] float64, None if unknown."""
+    """Takes positions of the run to those of the data's own files: [3, 4] float64; None where the
+    occupancy does not say how its run turned, moved and scaled the data."""
     frame = occupancy.report.get("data_frame") or occupancy.report.get("frame")
     rows = [numbers(row) for row in frame] if isinstance(frame, list) else []
     if [len(row) for row in rows] != [4, 4, 4]:
@@ -212,7 +215,8 @@ def in_parts(function: Callable[[Tensor], Tensor], positions: Tensor) -> Tensor:
 
 
 def exposed(kept: Tensor, beyond: bool = False) -> Tensor:
-    """Kept cells with a skipped neighbour, bool [X, Y, Z]; cells outside count as `beyond`."""
+    """Kept cells with at least one skipped neighbour of six: bool [X, Y, Z], as `kept`. `beyond`
+    says whether what lies beyond the cells counts as kept."""
     skipped = torch.nn.functional.pad(~kept, (1, 1) * 3, value=not beyond)
     shifts = [skipped.roll(step, axis) for axis in range(3) for step in (-1, 1)]
     return kept & torch.stack(shifts).any(dim=0)[1:-1, 1:-1, 1:-1]
@@ -231,7 +235,8 @@ class SceneColours(NamedTuple):
 
 
 def scene_colours(occupancy: Occupancy, description: Path | None) -> SceneColours | None:
-    """Colours by a scene's transforms.json; None if unknown, `InputError` for unreadable points."""
+    """Colours by a scene's transforms.json; None where points, colours or coordinates are unknown.
+    A file of points that cannot be read is an `InputError`."""
     points = None if description is None else coloured_points(description)
     back = to_the_data(occupancy)
     return None if points is None or back is None else SceneColours(points, back)

@@ -32,7 +32,8 @@ class FigureUnavailable(UserWarning):
 
 def image_metrics(predicted: Tensor, truth: Tensor) -> dict[str, float]:
     """The figures that ns-eval averages over images, of colours in 0..1, both [H, W, 3] float:
-    `psnr` (dB), `ssim`, and `flip` and `lpips` where they are at hand, as a NaN is no JSON."""
+    `psnr` (dB), `ssim`, and `flip` and `lpips` where they are at hand. Otherwise the key is absent:
+    nerfstudio turns every value into a float, and a NaN is no JSON."""
     metrics = {"psnr": psnr(predicted, truth), "ssim": ssim(predicted, truth)}
     distances = {"flip": flip(predicted, truth), "lpips": lpips(predicted, truth)}
     return metrics | {name: value for name, value in distances.items() if value is not None}
@@ -50,7 +51,7 @@ def psnr(predicted: Tensor, truth: Tensor) -> float:
 
 def ssim(predicted: Tensor, truth: Tensor) -> float:
     """Structural similarity of two [H, W, 3] images, at most 1, as nerfstudio's models compute it:
-    torchmetrics takes the data range from the two images."""
+    they leave the data range to torchmetrics, which takes it from the two images."""
     from torchmetrics.functional.image import structural_similarity_index_measure
 
     similarity = structural_similarity_index_measure(_batched(predicted), _batched(truth))
@@ -59,8 +60,8 @@ def ssim(predicted: Tensor, truth: Tensor) -> float:
 
 
 def flip(predicted: Tensor, truth: Tensor) -> float | None:
-    """Mean FLIP of two [H, W, 3] images in 0..1, at 67 pixels per degree: 0 for equal images, at
-    most 1; None without the package `flip-evaluator`."""
+    """Mean FLIP of two [H, W, 3] images in 0..1, at its default of 67 pixels per degree: 0 for
+    equal images, at most 1; None without the package `flip-evaluator`."""
     evaluate = flip_evaluator()
     if evaluate is None:
         return None

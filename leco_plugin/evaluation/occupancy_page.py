@@ -39,8 +39,10 @@ LIGHTING = {"ambient": 0.85, "diffuse": 0.4, "specular": 0.02, "fresnel": 0.0}
 
 
 def write_page(occupancy: Occupancy, path: Path, colours: SceneColours | None = None) -> Path:
-    """Writes the page: one file that needs no network, in the coordinates of the run. A click on a
-    name hides or shows a part.
+    """Writes the page: one file that needs no network, in the coordinates of the run.
+
+    It shows the faces of kept cells, the cameras, the box of the occupancy, and space that no
+    photograph shows. A click on a name hides or shows a part.
 
     Args:
         colours: of the scene; None colours by height.
@@ -103,7 +105,8 @@ def faces_of(inside: Tensor, box: ViewBox, beyond: bool) -> Tensor:
 
 
 def _kept_faces(occupancy: Occupancy, box: ViewBox, lowest: float) -> Tensor:
-    """Faces [F, 4, 3] of kept cells above the ground, as small as `MOST_FACES` allows."""
+    """Faces [F, 4, 3] of kept cells, without what is below the ground at `lowest`, scene units; in
+    cells as small as `MOST_FACES` allows."""
     for cells in CELLS:
         positions = box.middles(cells)
         kept = query(occupancy, positions) >= occupancy.threshold

@@ -192,7 +192,8 @@ def interesting_box(occupancy: Occupancy, cameras: Tensor) -> ViewBox:
 
 
 def heights_seen_from_above(occupancy: Occupancy, box: ViewBox) -> tuple[float, float]:
-    """Heights, scene units, of nearly all that a view straight down shows."""
+    """Heights, scene units, between which lies nearly all that a view straight down shows, without
+    what is kept below the ground."""
     _, positions, kept = _kept_cells(occupancy, box, CELLS)
     heights = torch.where(kept, positions[..., 2], -torch.inf).amax(dim=-1)
     heights = heights[heights.isfinite()].sort().values
@@ -206,7 +207,8 @@ def heights_seen_from_above(occupancy: Occupancy, box: ViewBox) -> tuple[float, 
 def differing_heights(
     occupancy: Occupancy, box: ViewBox, low: float, high: float
 ) -> tuple[float, float]:
-    """Two heights in whose layers most decisions differ; those of `HORIZONTAL` if few do."""
+    """Two heights between `low` and `high`, scene units, in whose layers most decisions differ;
+    those of `HORIZONTAL` where fewer than two layers both keep and skip."""
     heights = torch.linspace(low, high, LAYERS)
     x, y = (box.axis(a, count) for a, count in enumerate(box.cells(LAYER_CELLS)[:2]))
     positions = torch.stack(torch.meshgrid(heights, x, y, indexing="ij"), dim=-1)[..., [1, 2, 0]]

@@ -32,8 +32,11 @@ occupancy; a frozen gate, where its cell cache gave no answer."""
 @contextmanager
 def count_queries(model: nn.Module) -> Iterator[Counter[str]]:
     """Counts, by `KINDS`, the positions at which a model's fields are evaluated in this context.
-    Classes are wrapped, so that a field created meanwhile is counted. A frozen gate's queries in
-    CUDA kernels are not."""
+
+    What a routine in C asks of a field along rays is counted by its answer. Classes are wrapped
+    instead of objects, so that a field created meanwhile is counted, such as the one that learns an
+    occupancy for a host. A frozen gate's queries in CUDA kernels are not counted.
+    """
     count = Counter(dict.fromkeys(KINDS, 0))
     own = getattr(getattr(model, "mixture", model), "field", None)
     fields: list[nn.Module] = [module for module in model.modules() if isinstance(module, Field)]
@@ -102,15 +105,20 @@ WARM_UP = 1 / 16
 
 
 class GridUpdates:
-    """Watches the occupancy grids of a model, nerfacc's or like those. Their warm-up ends with
-    `WARM_UP` of the run's `share_at` a step, if not sooner."""
+    """Watches the occupancy grids of a model, nerfacc's or like those, from now on.
+
+    Args:
+        share_at: gives the share of the run that is over at a step. A warm-up ends with `WARM_UP`
+            of the run, if not sooner. None leaves it as it is.
+    """
 
     def __init__(self, model: nn.Module, share_at: Callable[[int], float] | None = None) -> None:
         self.share_at = share_at
         self.clock = Clock()
         """The time of all updates."""
         self.warming_up: bool | None = None
-        """Whether the last update asked all cells; None without a grid, or if it does not say."""
+        """Whether the last update was in a grid's warm-up, when nerfacc asks all cells; None
+        without a grid, or for one that does not say."""
         self.grids: list[Any] = [module for module in model.modules() if "occs" in module._buffers]
         for grid in self.grids:
             vars(grid)["update_every_n_steps"] = self._watched(grid.update_every_n_steps)

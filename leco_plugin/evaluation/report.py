@@ -53,14 +53,15 @@ def describe_machine() -> dict[str, Any]:
 
 
 def describe_cores(machine: Mapping[str, Any]) -> str:
-    """The CPU cores that a run used, in words: as many as its threads, if there are."""
+    """The CPU cores that a run used, in words: as many as its threads, if there are
+    so many."""
     cores = min(machine["cores"], machine["threads"])
     return "one CPU core" if cores == 1 else f"{cores} CPU cores"
 
 
 def describe_code() -> dict[str, Any]:
-    """Version of this package, commit of its checkout, and a digest of its files, which shows
-    changes. To be called before a measurement."""
+    """Version of this package, the commit if it is run from a checkout, and a digest of its files,
+    which shows uncommitted changes. To be called before a measurement."""
     from leco_plugin import __version__
 
     command = ["git", "-C", str(PACKAGE), "rev-parse", "--short=12", "HEAD"]

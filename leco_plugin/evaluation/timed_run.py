@@ -57,7 +57,7 @@ class TimedRun:
     steps: int = 0
     train_seconds: float = 0.0
     step_seconds: float | None = None
-    """Median of a step, once there is an occupancy if ever."""
+    """Median of a step; if there is ever an occupancy, of the steps with one."""
     learn_seconds: float | None = None
     """Of the training time: until there was an occupancy, or all updates of a grid."""
     freeze_seconds: float | None = None
@@ -114,8 +114,9 @@ def timed_run(
 ) -> tuple[TimedRun, Trainer]:
     """Trains until the budget is used and evaluates on the test images.
 
-    The learning rates of all groups decay to a tenth over the budget, whatever the number of steps.
-    A host that learns its occupancy first has the full rates at its own first step.
+    The learning rates of all groups decay to a tenth over the budget, whatever the number of steps:
+    nerfstudio's schedulers count steps, and a slow method would end with a high rate. A host that
+    learns its occupancy first has the full rates at its own first step.
 
     Args:
         config: a method with its data; it is copied, not changed.
@@ -316,7 +317,11 @@ def render_rays(model: Any, bundle: Any, at_once: int) -> Tensor:
 
 @torch.no_grad()
 def errors_on_rays(trainer: Trainer, rays: int) -> list[float]:
-    """Mean squared error of each test image on its share of `rays` pixels, always the same."""
+    """Mean squared error of each test image on its share of `rays` pixels, the same at every call.
+
+    A full image of an unguided method takes minutes on a CPU; some thousand pixels say as much. A
+    scene without test images is an `InputError`.
+    """
     pipeline = trainer.pipeline
     pipeline.eval()
     dataset: Any = pipeline.datamanager.eval_dataset
@@ -341,9 +346,15 @@ def errors_on_rays(trainer: Trainer, rays: int) -> list[float]:
 
 @torch.no_grad()
 def evaluate_images(trainer: Trainer, most_images: int, queries: Counter[str]) -> dict[str, float]:
-    """Means of figures of whole test images, evenly chosen, as `image_metrics` has them; samples
-    and queries a ray; median `render_seconds_per_image`. The model has rendered before, so that
-    nothing is built on the way."""
+    """Figures over whole test images, evenly chosen; rendering alone is timed.
+
+    The model has to have rendered before, so that nothing is built on the way.
+
+    Returns:
+        Means of what `image_metrics` has, of `samples_per_ray`, and of `field_queries_per_ray`,
+        `proposal_queries_per_ray` and `gate_queries_per_ray`; and the median of
+        `render_seconds_per_image`.
+    """
     pipeline = trainer.pipeline
     pipeline.eval()
     dataset: Any = pipeline.datamanager.eval_dataset
