@@ -28,14 +28,16 @@ class Case:
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the model; those of the occupancy count for what learns one."""
     settings: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of the whole method."""
     grid_levels: int = 1
     """Nested boxes of occupancy grids: as many as somebody who knows the scene would take."""
     fine_grid: bool = False
     """Whether the size of cells is the question, so that 256^3 are tried too. To keep these up to
     date takes a core of a CPU minutes."""
     only: tuple[str, ...] = ()
-    """Samplers that it has something to say about, besides references; none is all."""
+    """Samplers that it has something to say about; none is all. References join by themselves."""
     seeds: int = 1
+    """The fewest that learned occupancy has in it."""
     must_fail: bool = False
     """Whether it shows that the suite can tell a failure: learned occupancy has to fail in it."""
 

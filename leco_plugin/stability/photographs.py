@@ -1,7 +1,10 @@
 """The scenes of the cases, photographed and written in nerfstudio's format, with the truth.
 
-All but the far ones lie within four metres of the middle. Whatever stands in them is grey, for a
-host learns hue late; only the sky is blue. What goes wrong touches the training pictures only.
+All but the far ones lie within four metres of the middle. Whatever stands in them is grey; only the
+sky is blue. A host learns hue late, in some seeds hundreds of steps later than in others, and this
+says nothing about where it samples.
+
+What goes wrong touches the training pictures only: the held-out ones show what is really there.
 truth/NAME.npz holds, for each held-out picture, `depth` [h, w] in metres along the rays (inf for no
 surface), `detail` [h, w], the pixels in which something is seen that the case is about, and
 `shown_by` [h, w], how many training pictures show the same surface.
@@ -258,7 +261,10 @@ class View(NamedTuple):
 
 
 def count_views(view: View, others: Sequence[View]) -> NDArray[np.int32]:
-    """[h, w] how many others show what a picture shows. In one alone, a surface has no depth."""
+    """[h, w] how many of the other pictures show what a picture shows; 0 where it shows nothing.
+
+    A surface in one picture alone has no depth that could be learned: whether it is kept is chance.
+    """
     counts = np.zeros(view.depth.shape, dtype=np.int32)
     there = np.isfinite(view.depth)
     points = view.lens.points(view.pose, view.depth)[there]
@@ -268,8 +274,10 @@ def count_views(view: View, others: Sequence[View]) -> NDArray[np.int32]:
 
 
 def write_scene(stage: Stage, capture: Capture, folder: Path) -> Path:
-    """Writes the scene, whole, unless `folder`, which is returned, holds just this one; an
-    `InputError` where it holds no scene of ours."""
+    """Writes the scene to `folder`, unless it holds just this one; returns the folder.
+
+    The scene appears only when it is complete. A folder with something else is an `InputError`.
+    """
     description = folder / DESCRIPTION
     described = {"digest": digest_of(stage, capture), "capture": asdict(capture)}
     text = json.dumps(described, indent=1) + "\n"

@@ -1,7 +1,7 @@
 """Which samplers are compared, each in a host; which runs a table needs; and how long they take.
 
-All have the same sizes, rays and steps. A sampler is held against the dense reference of its own
-host: Instant-NGP, or Nerfacto for proposal networks.
+The sizes, rays and steps are the same for all samplers. A sampler is held against the dense
+reference of its own host: Instant-NGP, or Nerfacto for proposal networks.
 """
 
 from __future__ import annotations
@@ -52,7 +52,8 @@ class Sizes:
     """Binary logarithm of the entries of the hosts' hash tables."""
 
     def host(self, in_nerfacto: bool) -> dict[str, Any]:
-        """Nerfacto, or Instant-NGP with steps that grow with the distance."""
+        """Nerfacto, or Instant-NGP with steps that grow with the distance: its rays end well beyond
+        the scene."""
         sizes = {"host.log2_hashmap_size": self.table, "host.max_res": 512, "host.far_plane": 20.0}
         if in_nerfacto:
             return {**sizes, "host.use_appearance_embedding": False}
@@ -91,7 +92,8 @@ SAMPLERS = {
 
 
 def samplers_named(names: tuple[str, ...]) -> list[Sampler]:
-    """Samplers of these names and their references; an `InputError` for an unknown name."""
+    """The samplers of these names and the references they are held against, in the table's order;
+    an `InputError` for an unknown name."""
     unknown = [name for name in names if name not in SAMPLERS]
     if unknown:
         raise InputError(f"there is no sampler {unknown[0]!r}; there are {', '.join(SAMPLERS)}")
@@ -111,7 +113,8 @@ def contender_of(
     settings: Mapping[str, Any],
     grid_levels: int = 1,
 ) -> Contender:
-    """The sampler in its host under the conditions of a case."""
+    """The sampler in its host under the conditions of a case. Changes of the model that are about
+    learning are left out where nothing is learned."""
     name = sampler.name
     in_nerfacto = name in (PROPOSALS, DENSE_PROPOSAL)
     own: dict[str, Any] = {"occupancy.sampler": name}
@@ -153,6 +156,7 @@ class Run(NamedTuple):
 
     @property
     def key(self) -> Key:
+        """The same for what is run once, however many cells share it."""
         return self.scene, self.job.name
 
 
@@ -181,7 +185,10 @@ def entries_of(
 
     Args:
         seeds: of each cell. Learned occupancy has more where a case is about seeds.
-        beside: those of `seeds` that other samplers have; none is all. Others are an `InputError`.
+        beside: seeds of the samplers that learned occupancy is compared with, some of `seeds`; none
+            is `seeds`.
+    Raises:
+        InputError: a seed of `beside` is none of `seeds`, so that nothing is compared with it.
     """
     if alone := [seed for seed in dict.fromkeys(beside) if seed not in seeds]:
         raise InputError(f"--seeds-beside {alone[0]} is none of --seeds: add it there")
@@ -229,7 +236,8 @@ def capture_of(case: Case, sizes: Sizes) -> Capture:
 
 
 def core_seconds(runs: Sequence[Run], stored: Sequence[Mapping[str, Any]]) -> float:
-    """Seconds of one core: as stored runs of their samplers, else as the longest of any."""
+    """Seconds that runs to be made take of one core: as long as stored ones of their samplers, else
+    as the longest of any."""
     measured: defaultdict[str, list[float]] = defaultdict(list)
     for record in stored:
         measured[record["sampler"]].append(float(record["processor_seconds"]))

@@ -1,7 +1,8 @@
 """Small scenes and what is seen in them: exact colours and depths along any ray.
 
-Fog is integrated in fine steps, and glass is laid over what is behind it. Positions are in metres,
-+z up. A ray that begins inside a shape meets it from within: a box around the camera is a room.
+Rays meet surfaces in closed form. Fog is integrated in fine steps, and glass is laid over what is
+behind it, both as exactly as a picture of eight bits can show. Positions are in metres, +z up. A
+ray that begins inside a shape meets it from within: a box around the camera is a room.
 """
 
 from __future__ import annotations
@@ -61,7 +62,8 @@ class Box:
         return np.minimum(*sides).max(1), np.maximum(*sides).min(1)
 
     def meet(self, origins: Array, directions: Array) -> tuple[Array, Array]:
-        """Distances [N], metres, inf for none, at which rays [N, 3] meet it; normals [N, 3]."""
+        """Where rays [N, 3] first meet the surface: distances [N], metres along unit directions,
+        inf for none; and outward normals [N, 3]."""
         low, high = np.array(self.low), np.array(self.high)
         enters, leaves = self.span(origins, directions)
         t = np.where(enters > _TINY, enters, leaves)

@@ -104,10 +104,14 @@ def make_table(
 
 
 class Suite:
-    """One table: its scenes, its runs, and its results so far, in the folder `out`.
+    """One table: its scenes, its runs, and its results so far.
 
-    Other arguments are as of `entries_of`. `ValueError` or `OSError` where there is nothing to run,
-    or the folder is of something else, of other sizes or versions.
+    Args:
+        out: its folder; `scenes` holds what is photographed, `runs` what was run, by scene.
+        cases, samplers, seeds, sizes, beside: as of `entries_of`.
+    Raises:
+        ValueError, OSError: there is nothing to run or no seed, or the folder is of something else,
+            of other sizes or versions.
     """
 
     def __init__(
@@ -147,6 +151,7 @@ class Suite:
             self.folders[name] = RunFolder(out / RUNS / name, settings | {"sizes": asdict(sizes)})
 
     def runner(self, scene: str) -> Runner:
+        """Makes the runs of a scene in processes, with one thread each if there are several."""
         threads = 1 if self.workers > 1 else None
         place = self.data[scene], self.protocol, self.folders[scene]
         return ProcessRunner(*place, WORKER, threads, self.stop)
@@ -184,8 +189,8 @@ class Suite:
     def make(self, say: Say, show: Callable[[float], None], seconds: float = math.inf) -> None:
         """Makes what is missing; whenever this is stopped, what was finished is kept.
 
-        But for the first runs, one that would go on after so many seconds is left for another time.
-        `say` and `show` are as of `make_jobs`.
+        A run that would end later than in so many seconds is left for another time, but for those
+        that start at once. `say` and `show` are as of `make_jobs`.
         """
         todo, ends = self.missing(), time.monotonic() + seconds
 

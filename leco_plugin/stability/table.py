@@ -37,7 +37,8 @@ HOW_TO_READ = (
     "- nothing to compare with: the dense run does not train"
 )
 LOST = 0.005
-ON_LIGHT = {
+"""Share of the surfaces from which on the picture says how much is lost."""
+ON_LIGHT = {  # the ground of a cell, and the ink on it
     "pass": ("#d7f0df", "#0f5a2f"),
     "degraded": ("#fbeab8", "#6b4c00"),
     "fail": ("#f6c9c4", "#8c1d13"),
@@ -120,7 +121,8 @@ def _count_passes(results: Results) -> str:
 
 
 def verdicts_of(results: Results, sampler: str) -> list[str]:
-    """Verdicts of a sampler on cases that need not fail; one for all cells of the same runs."""
+    """Verdicts of a sampler on all cases but those that must fail; where cells are made of the same
+    runs, one verdict for all of them."""
     found: dict[Any, str] = {}
     for row in results["cases"]:
         if not row["must_fail"] and sampler in row["cells"]:
@@ -131,7 +133,8 @@ def verdicts_of(results: Results, sampler: str) -> list[str]:
 
 
 def blind(results: Results) -> list[str]:
-    """Why the suite cannot be believed: cases that must fail, and did not by their figures."""
+    """Why the suite cannot be believed, in a line each: cases that must fail, and have been run
+    without failing for what is measured of them."""
     said = []
     for row in results["cases"]:
         cell = row["cells"].get(LEARNED)
@@ -145,6 +148,7 @@ def blind(results: Results) -> list[str]:
 
 
 def is_unproven(results: Results) -> bool:
+    """Whether a case that must fail has not failed: then nobody knows what this table notices."""
     cells = [row["cells"].get(LEARNED, {}) for row in results["cases"] if row["must_fail"]]
     return bool(blind(results)) or any(cell.get("verdict") != "fail" for cell in cells)
 
@@ -226,6 +230,7 @@ def _draw_cell(
 
 
 def _wrong(cell: Mapping[str, Any]) -> str:
+    """What a cell that does not pass suffers from, in two words."""
     if cell["psnr"] is None or cell["verdict"] in ("pass", "no reference"):
         return ""
     if cell["gap"] is not None and (cell["lost_mass"] or 0.0) >= LOST:

@@ -74,7 +74,8 @@ def judge(
     """The cell of a sampler in a case, by its finished runs.
 
     Args:
-        reference: runs of its dense reference; None where it is one itself.
+        reference: runs of its dense reference, of which the same seeds count; None where it is one
+            itself.
         failures: reasons of its runs that have ended without a result.
         missing: number of its runs that have not been made.
     """
@@ -114,7 +115,8 @@ def _of_the_same_seeds(some: Runs, others: Runs) -> Runs:
 
 
 def _broken(cell: Cell, bars: Bars, lost: float) -> str:
-    """The first bar that a cell breaks, in words; `lost` is beyond the reference's share."""
+    """The first bar that a cell is on the wrong side of, in words; `lost` is the share of surfaces
+    lost beyond the reference's."""
     if cell.gap is not None and cell.gap < -bars.below_reference:
         return f"{-cell.gap:.2f} dB below dense"
     if cell.detail_gap is not None and cell.detail_gap < -bars.detail:
@@ -127,7 +129,7 @@ def _broken(cell: Cell, bars: Bars, lost: float) -> str:
 
 
 def _unmeasured(runs: Runs, reference: Runs) -> str:
-    """The first figure that is missing or no number, in words."""
+    """The first figure that is missing or no number, in words: what was not seen is not passed."""
     wanted = ["kept_fraction", "trivial_psnr"]
     wanted += [name for name in ("lost_mass", "detail_psnr") if _values(reference, name)]
     for run in runs:

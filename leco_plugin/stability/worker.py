@@ -107,6 +107,8 @@ def measure(
 ) -> tuple[Measured, NDArray[np.uint8]]:
     """Looks at the held-out pictures of a case's scene, in the folder `data` with its truth.
 
+    Args:
+        dense_samples: candidates of a ray of a proposal host's reference.
     Returns:
         The figures, and the first picture [h, w, 3] as the host renders it.
     """
@@ -185,8 +187,8 @@ def find_samples(
         depth: [N] distance of each ray's surface, scene units; inf for none.
         dense_samples: candidates of a ray of a proposal host's reference.
     Returns:
-        [N] distance of the surface from the middle of the nearest sample, inf without one; numbers
-        of samples, and of candidates of the dense reference.
+        [N] distance of the surface from the middle of the nearest sample, inf without one; number
+        of samples; and number of candidates of the dense reference.
     """
     is_packed = not hasattr(model, "proposal_sampler")
     sample = _sample_packed if is_packed else partial(_sample_proposals, dense_samples)
