@@ -54,7 +54,8 @@ def stored_bytes(row: Row) -> int:
 
 
 def choose(rows: Sequence[Row]) -> Row:
-    """The one beside which no other keeps so much less that its bytes pay."""
+    """The representation beside which no other keeps so much less that its bytes pay. One that
+    keeps all is chosen only if all do."""
     power = -math.log10(WORTH_TEN_TIMES)
 
     def worth(row: Row) -> tuple[bool, float, int]:

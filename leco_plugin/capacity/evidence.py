@@ -74,8 +74,8 @@ class Loss(NamedTuple):
 def gather(
     mixture: Mixture | None, occupancy: Occupancy | None, seen: Seen
 ) -> tuple[Evidence, list[Rendered]]:
-    """Candidates of rays with their worth, and renderings by a model; without an original all are
-    kept."""
+    """The candidates of some rays with their worth, all kept where there is no original; and their
+    renderings if there is a model."""
     pieces, rendered = [], []
     parts = in_chunks(seen.rays, RAYS_AT_ONCE), seen.truth.split(RAYS_AT_ONCE)
     for rays, truth in zip(*parts):
@@ -150,9 +150,10 @@ def unlikely_at(look: int) -> float:
 def loss(evidence: Evidence, skipped: Tensor, unlikely: float = UNLIKELY) -> Loss:
     """The share of the worth that is skipped, and Bernstein's bound of a ratio of sums over rays.
 
-    Rays count by their worth: n = (sum worth)^2 / sum worth^2. A loss that no ray has seen has no
-    spread, so a few more lost rays of average worth are included: without any loss the bound is
-    log(1 / unlikely) / n. It may be wrong as often as is `unlikely`.
+    Rays count by their worth: n = (sum worth)^2 / sum worth^2, so that a ray of sky is no evidence.
+    A loss that no ray has seen has no spread. The error therefore includes a few more lost rays of
+    average worth: without any loss the bound is log(1 / unlikely) / n, which n rays do exclude. It
+    may be wrong as often as is `unlikely`.
     """
     lost_all, all_weight = (float((evidence.weights * m).sum()) for m in (skipped, 1.0))
     lost_mass = lost_all / max(all_weight, 1e-12)

@@ -154,8 +154,11 @@ def measure(evidence: Evidence, scores: Tensor, of_volume: Tensor, lost: float) 
 
 
 def lost_where(worth: Tensor, scores: Tensor, of_volume: Tensor, share: float) -> float:
-    """Share of the worth [M] that is lost where just so much of the volume is kept. Of places with
-    the threshold's score, as many cells may have, a part is kept by lot."""
+    """Share of the worth [M] of candidates that is lost where just so much of the volume is kept.
+
+    Many cells of a grid may have the score of the threshold. A part of them is kept, drawn by lot:
+    all of them would be more than is asked for.
+    """
     threshold = find_threshold(of_volume, share)
     above, at = (
         float(part.double().mean()) for part in (of_volume > threshold, of_volume == threshold)
@@ -182,7 +185,8 @@ def measure_candidate(taught: Taught, candidate: Candidate, lost: float) -> dict
 def taught_score(
     config: GateConfig, lesson: Lesson, precision: Precision
 ) -> Callable[[Tensor], Tensor]:
-    """The logit [N] of a gate that is taught now, as stored: of mapped positions [N, 3]."""
+    """The logit [N] of a gate that is taught now, as it would be stored and asked: of mapped
+    positions [N, 3]."""
     gate = teach(config, lesson, STEPS, precision)
 
     @torch.no_grad()
@@ -194,7 +198,7 @@ def taught_score(
 
 
 def _measure_grid(taught: Taught, candidate: Candidate, lost: float) -> dict[str, Any]:
-    """Dilated by a cell where it keeps less so."""
+    """What a taught grid keeps and loses, dilated by a cell where it keeps less so."""
     assert candidate.resolution is not None
     box = mapped_box(taught.mixture)
     scores = taught_grid(taught.lesson, box, candidate.resolution)
@@ -210,7 +214,8 @@ def _measure_grid(taught: Taught, candidate: Candidate, lost: float) -> dict[str
 
 
 def taught_grid(lesson: Lesson, box: ViewBox, cells: int) -> Tensor:
-    """Scores [n, n, n] of a grid: a cell has the largest target of the lesson in it."""
+    """Scores [n, n, n] of a grid that the lesson of the gates teaches: a cell has the largest
+    target in it."""
     scores = torch.zeros((cells,) * 3, device=lesson.mapped.device)
     return largest_in_cells(scores, box, lesson.mapped, 1.0 - lesson.skip)
 
@@ -248,12 +253,9 @@ def capacity(
         "teach_steps": STEPS,
         "grids": "by the lesson of the gates",
     }
-    file = out / SETTINGS
-    if file.is_file() and read_object(file, DAMAGED).get("scene") != scene:
-        raise InputError(
-            f"{out} holds points of another scene than {data}; name a new folder with --out"
-        )
-    take_folder(file, {"scene": scene, **settings}, "points with another", DAMAGED)
+    words = {"scene": f"points of another scene than {data}"}
+    holds = "points with another"
+    take_folder(out / SETTINGS, {"scene": scene, **settings}, holds, DAMAGED, words)
     candidates = [*gates(), *_grids_that_fit(resolutions)]
     taught = prepare(data, out, learn_steps)
     rows = _measure_missing(out, taught, candidates, lost_surface_mass, code)

@@ -1,7 +1,7 @@
 """The fields that say what a dropped candidate was worth, and what a gate loses by them.
 
 What a smaller gate declares holds against each of them, along rays of held-out pixels and of places
-between the cameras, no two of the same pixel.
+between the cameras, which no photograph shows. No two of these rays share a pixel.
 - The field at the moment of freezing, with every candidate rendered, gives the whole loss.
 - The run's field of now, guided by the original, gives the loss beyond the original's own. The two
   are added.
@@ -38,7 +38,7 @@ DECLARED = ("lost_surface_mass", "lost_mass", "image_price_db")
 """What a report says of the original's own losses."""
 LOST_DECISIONS = "lost_decisions"
 """In the report of a gate shrunk without a field: the share of the first original's keep decisions
-that it drops, weighed by o(x). Its lost surface mass is not known."""
+that it drops, weighed by o(x). The surface mass that it loses is not known."""
 RAYS = 1 << 15
 """On each side. Losses lie on few rays, and held-out pixels are few: of n rays of equal worth the
 first look declares no loss below 5.3 / n, the tenth none below 9.3 / n."""
@@ -93,7 +93,8 @@ class Ground(NamedTuple):
         return not all(reference.guided for reference in self.references)
 
     def losses(self, gate: Occupancy, side: str, unlikely: float) -> list[Loss]:
-        """What a gate loses in all, by each reference, on its side `search` or `verify`."""
+        """What a gate loses in all, by each reference, on its side `search` or `verify`; the bounds
+        may be wrong as often as is `unlikely`."""
         found = []
         for one in self.references:
             part: Part = getattr(one, side)
@@ -103,8 +104,8 @@ class Ground(NamedTuple):
         return found
 
     def price(self, gate: Occupancy, side: str, absolute: bool = False) -> float | None:
-        """The worst image price by any reference, dB, or only by those that measure the original
-        itself; None where nothing is rendered."""
+        """The worst image price of a gate by any reference, dB; if `absolute`, only by those that
+        measure the original itself. None where nothing is rendered."""
         prices = []
         for one in self.references:
             part: Part = getattr(one, side)
@@ -131,7 +132,8 @@ class Bounds:
 
 @dataclass
 class Rung:
-    """One gate that was tried. Losses are the worst of any reference, the original's included."""
+    """One gate that was tried. Losses are the worst of any reference, the original's included;
+    without a field they are of its decisions."""
 
     name: str
     params: int
@@ -155,8 +157,11 @@ class Rung:
 def pair_sides(
     source: Source, original: Occupancy, held_out: Sequence[Seen]
 ) -> list[tuple[Seen, Seen]]:
-    """Rays of held-out pixels, each with as many others as are missing to `RAYS`. Those are of
-    further training pixels, moved between the cameras where there is a field."""
+    """Rays of held-out pixels, each with as many others as are missing to `RAYS`.
+
+    The others are of further training pixels. Where there is a field they are moved between the
+    cameras, and have no image price. No two of all these share a pixel.
+    """
     more: list[Seen] = []
     for seen in held_out:
         missing = max(1, RAYS - len(seen.truth))
@@ -194,7 +199,8 @@ def find_references(
 def measure_shares_lost(
     source: Source, original: Occupancy, smaller: Occupancy, seen: Seen
 ) -> dict[str, float]:
-    """What a smaller gate, or the original itself, loses on some rays by each reference."""
+    """What a smaller gate loses on some rays by each reference: a share of the surface mass, or of
+    the decisions where there is no field. Of the original itself, only what is measured."""
     alone, found = source.mixture is None, dict[str, float]()
     before = declared(original, LOST_DECISIONS if alone else "lost_surface_mass")
     if source.frozen is not None:
@@ -221,8 +227,9 @@ def declared(original: Occupancy, name: str) -> float:
 def verify(ground: Ground, smaller: Occupancy, bounds: Bounds, rung: Rung, look: int) -> bool:
     """Whether the bounds hold on rays that the search did not see.
 
-    The rung gets what is to be declared. Losses on the rays of the search count where they
-    are larger. Each look may accept a gate by chance, so that later ones are allowed less.
+    The rung gets what is to be declared. Losses on the rays of the search count where they are
+    larger: most of a loss lies on few rays, which may all be among those. Each look at these rays,
+    by its number from 1 on, may accept a gate by chance, so that later ones are allowed less.
     """
     unlikely = unlikely_at(look)
     searched = ground.losses(smaller, "search", unlikely)

@@ -71,6 +71,7 @@ class Candidate:
 
 
 def gates() -> list[Candidate]:
+    """Gates of growing size of each kind, for `leco capacity`."""
     found = []
     for octaves, width, layers in FREQUENCY_SIZES:
         gate = GateConfig(EncodingConfig(octaves=octaves), width, layers, 1)
@@ -92,7 +93,8 @@ def grids(resolutions: tuple[int, ...]) -> list[Candidate]:
 
 
 def ladder(most_values: int) -> list[GateConfig]:
-    """The gates that `leco shrink` tries, by size: all with fewer values, one scene expert each."""
+    """The gates that `leco shrink` tries, by size: all that have fewer values than given. They have
+    one scene expert, for o(x) is all that is asked of an occupancy."""
     found = [
         GateConfig(EncodingConfig(octaves=octaves), width, layers, 1, octaves < ENOUGH_OCTAVES)
         for octaves, width, layers in FREQUENCY
@@ -109,6 +111,7 @@ def ladder(most_values: int) -> list[GateConfig]:
 
 
 def _on_planes(cells: int, features: int, levels: int) -> GateConfig:
+    """A gate on K-planes: one level of `cells` along an axis, or several from 16 up to that."""
     coarsest = 16 if levels > 1 else cells
     encoding = EncodingConfig(
         "k-planes", levels=levels, features=features, coarsest=coarsest, plane_cells=cells
@@ -227,7 +230,11 @@ def lesson_of(original: Occupancy, taught: Evidence) -> Lesson:
 def _measure(
     ground: Ground, smaller: Occupancy, bounds: Bounds, volume: Tensor, kept: float, look: int
 ) -> tuple[Rung, Occupancy]:
-    """What is found of a gate, and the gate with its threshold; `look` is the next one's number."""
+    """What is found of a gate, and the gate with the threshold that it was found with.
+
+    The original keeps a share `kept` of places `volume` [P, 3] in its box. A look at the verifying
+    rays would have the number `look`.
+    """
     losses_at = _losses_of(smaller, ground.references)
     of_volume = in_parts(smaller.query, volume)
     lost, holds, ratio = 0.0, False, 0.0
@@ -281,9 +288,12 @@ def _losses_of(
 def lower_threshold(ground: Ground, bounds: Bounds) -> Occupancy | None:
     """The original at the largest lower threshold that meets what is asked of a smaller gate.
 
-    Calibration allows a loss in the mean of held-out rays; what is declared holds on others, too,
-    and a smaller gate loses more. None where the original meets that as it is, no threshold does,
-    or nothing measures.
+    Calibration allows a loss in the mean of some thousand held-out rays, but what is declared has
+    to hold on others, too, and a smaller gate loses more than the original that teaches it. So an
+    original that itself loses too much is asked to keep more.
+
+    It shares the original's gate. None where the original meets that as it is, no threshold does,
+    or nothing measures it.
     """
     original = ground.original
     absolute = [reference for reference in ground.references if not reference.guided]

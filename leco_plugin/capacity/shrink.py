@@ -131,7 +131,8 @@ def _open(file: Path, data: Path, out: Path, bounds: Bounds) -> tuple[Source, Oc
 def _meet_bounds(
     source: Source, original: Occupancy, file: Path, bounds: Bounds
 ) -> tuple[Ground, Rung, dict[str, float] | None]:
-    """What gates are taught on, what the original loses, and how far its threshold was lowered."""
+    """What smaller gates are taught and measured on, what the original itself loses there, and how
+    far its threshold was lowered to lose less."""
     drawn = draw_rays(source, original)
     ground = prepare(source, original, *drawn)
     itself = measure_original(ground, bounds)
@@ -158,8 +159,11 @@ def _meet_bounds(
 def _find_smaller(
     ground: Ground, bounds: Bounds, itself: Rung, tell: Callable[[Rung], None]
 ) -> tuple[Found, Occupancy]:
-    """The gates that were tried, and what is stored. The original gets rounded weights, which
-    change no decision, and, where it is measured, what is to be declared."""
+    """The gates that were tried, and what is stored: the original again where none of them holds.
+
+    Its weights are rounded where autocast rounds them anyway: not a decision changes. Where a
+    reference measures it, `itself` gets what is to be declared.
+    """
     found, original = Found(None, []), ground.original
     if itself.verdict == HOLDS:
         with bar("Teaching smaller gates") as show:
@@ -227,8 +231,8 @@ def _check_original(original: Occupancy, file: Path, bounds: Bounds) -> None:
 
 
 def check_losses(source: Source, original: Occupancy, file: Path, bounds: Bounds) -> None:
-    """Raises `ValueError` for an original whose losses are unknown or leave nothing of the bounds.
-    With the field at freezing its threshold can be lowered."""
+    """Raises `ValueError` for an original whose own losses are unknown, or leave nothing of the
+    bounds. With the field at freezing the threshold can be lowered, so that any loss will do."""
     if source.model is not None and LOST_DECISIONS in original.report:
         raise ValueError(
             f"{file} was shrunk without its run, so that nobody knows what it has lost of the "
@@ -254,7 +258,8 @@ def check_losses(source: Source, original: Occupancy, file: Path, bounds: Bounds
 def _check_on_test_photographs(
     source: Source, original: Occupancy, smaller: Occupancy
 ) -> dict[str, Any] | None:
-    """What the smaller gate loses on test photographs: worst of all references, and by each."""
+    """What the smaller gate loses on rays of test photographs, which decided nothing here: worst of
+    all references, and by each. None without such photographs, or where nothing measures it."""
     seen = draw_test_rays(source, original, RAYS)
     shares = {} if seen is None else measure_shares_lost(source, original, smaller, seen)
     if seen is None or not shares:
@@ -322,13 +327,15 @@ def _report_of(
 
 
 def _named_loss(alone: bool, share: float | None) -> dict[str, float | None]:
+    """A loss by its name: without a field it is one of decisions, and that of surfaces unknown."""
     if alone:
         return {"lost_surface_mass": None, LOST_DECISIONS: share}
     return {"lost_surface_mass": share}
 
 
 def compare_queries(original: Occupancy, smaller: Occupancy) -> tuple[float, list[float]]:
-    """How many times faster the smaller gate answers, and the median milliseconds of each."""
+    """How many times faster the smaller gate answers, in the median of interleaved pairs, and the
+    median milliseconds of each."""
     positions = whole_box(original).draw(TIMED_POSITIONS).to(original.threshold_value.device)
 
     def seconds(occupancy: Occupancy) -> float:

@@ -1,4 +1,7 @@
-"""Photographs and their rays, and the model of the run that learned an occupancy."""
+"""Photographs and their rays, and the model of the run that learned an occupancy.
+
+The rendering weights of that model say what a dropped candidate was worth.
+"""
 
 from __future__ import annotations
 
@@ -103,7 +106,8 @@ def _load_run(folder: Path, data: Path) -> Source | None:
 
 
 def check_scene(source: Source, occupancy: Occupancy, data: Path) -> None:
-    """Raises `InputError` where fewer than half of the occupancy's cameras took the photographs."""
+    """Raises `InputError` where fewer than half of the cameras that an occupancy's report names
+    took the photographs."""
     known = cameras_of(occupancy)
     if len(known) == 0:
         return
@@ -149,7 +153,8 @@ def draw_training_rays(source: Source, occupancy: Occupancy, count: int) -> Seen
 def draw_other_pixels(
     source: Source, occupancy: Occupancy, count: int, besides: Iterable[Seen]
 ) -> Seen:
-    """Rays of different training pixels, besides others; fewer in small photographs."""
+    """Rays of different training pixels, none of them of the rays `besides`; fewer than `count`
+    where the photographs have hardly more pixels."""
     known = [_numbers(seen.pixels) for seen in besides if seen.pixels is not None]
     taken = np.concatenate([np.empty(0, np.int64), *known])
     pieces: list[tuple[Tensor, Tensor]] = []
@@ -169,7 +174,8 @@ def draw_other_pixels(
 
 
 def move_between_cameras(source: Source, seen: Seen, seed: int) -> Seen:
-    """Rays of training images, each moved by a random part of the way to the nearest camera."""
+    """The same rays of training images, each moved by a random part of the way from its camera to
+    the nearest one. The colours are not those of the moved rays."""
     rays = seen.rays
     assert source.model is not None and rays.images is not None
     images = rays.images.cpu()
@@ -237,7 +243,7 @@ def _see_pixels(source: Source, occupancy: Occupancy, pixels: Tensor, truth: Ten
 
 
 def _numbers(pixels: Tensor) -> np.ndarray:
-    """A number for each different pixel [R, 3]: [R] int64."""
+    """A different number for each different pixel [R, 3]: [R] int64."""
     image, row, column = pixels.cpu().numpy().T
     return (image << 40) + (row << 20) + column
 

@@ -63,7 +63,8 @@ class RunFolder:
 
     @contextmanager
     def alone(self) -> Iterator[None]:
-        """Deletes what killed processes left; an `InputError` where another process makes jobs."""
+        """Keeps other processes from making jobs here, and deletes what killed ones left. Another
+        process that makes some is an `InputError`."""
         with alone_in(self.path, "chart"):
             self.clear()
             yield
@@ -109,19 +110,24 @@ def take_folder(
     settings: Mapping[str, Any],
     holds: str = "a chart with another",
     damaged: str = DAMAGED,
+    words: Mapping[str, str] | None = None,
 ) -> None:
     """Writes settings to a file in a new or empty folder, or checks those that it holds.
 
     Args:
         holds: what is said of a folder before the first setting that is not as wanted.
         damaged: what is said of a damaged file.
+        words: what is said of a folder with another value of a setting, by its name, instead of
+            `holds` and both values.
     Raises:
         InputError: it holds something else, or has other settings; nothing was written.
     """
     folder = file.parent
     if file.is_file():
-        if other := difference(read_object(file, damaged), settings):
-            raise InputError(f"{folder} holds {holds} {other}; name a new folder with --out")
+        found = read_object(file, damaged)
+        if (name := _first_other(found, settings)) is not None:
+            said = (words or {}).get(name) or f"{holds} {difference(found, settings)}"
+            raise InputError(f"{folder} holds {said}; name a new folder with --out")
     elif folder.exists() and (not folder.is_dir() or set(os.listdir(folder)) - {LOCK}):
         raise InputError(f"{folder} holds something else; name a new folder with --out")
     else:
@@ -130,11 +136,16 @@ def take_folder(
 
 def difference(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str | None:
     """The first setting that is not as wanted, in words; None where all are."""
-    for name, value in json.loads(json.dumps(wanted)).items():
-        if found.get(name) != value:
-            said = f"{_short(found.get(name))}, not {_short(value)}"
-            return f"{name.replace('_', ' ')} ({said})"
-    return None
+    if (name := _first_other(found, wanted)) is None:
+        return None
+    value = json.loads(json.dumps(wanted[name]))
+    return f"{name.replace('_', ' ')} ({_short(found.get(name))}, not {_short(value)})"
+
+
+def _first_other(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str | None:
+    """The name of the first setting that is not as wanted; None where all are."""
+    stored = json.loads(json.dumps(wanted))  # tuples as lists
+    return next((name for name, value in stored.items() if found.get(name) != value), None)
 
 
 def _short(value: Any) -> str:
@@ -285,8 +296,11 @@ def _reason(work: Path, status: int, log: Path) -> str:
 
 
 def work_on(folder: Path, make: Callable[..., dict[str, Any]]) -> int:
-    """Makes the job in a folder: the other side of `ProcessRunner`, called in its process. Leaves
-    the result, or the reason why there is none, and returns 0, or 1 on failure."""
+    """Makes the job in a folder: the other side of `ProcessRunner`, called in its process.
+
+    `make` is called with the values of the job and what reports the share that is done. Its result
+    is left in the folder, or the reason why there is none; returns 0, or 1 on failure.
+    """
     shown = 0.0
 
     def show(share: float) -> None:
