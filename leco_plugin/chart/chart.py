@@ -47,7 +47,8 @@ NOTHING_SKIPPED = "; no occupancy was learned in this time, so that nothing was 
 
 
 def jobs_of(contenders: Sequence[Contender], seeds: Sequence[int]) -> list[Job]:
-    """All runs. Contenders take turns, so that a machine whose speed drifts treats them alike."""
+    """All runs. Contenders take turns within a seed, and each seed begins with another one, so
+    that a machine whose speed drifts treats them alike."""
     jobs = []
     for turn, seed in enumerate(dict.fromkeys(seeds)):
         first = turn % len(contenders)
@@ -102,7 +103,8 @@ class Chart:
         """Makes what is missing; whenever it is stopped, what was finished is kept.
 
         Args:
-            runner: called in several threads for several runs at once; `stop` ends them.
+            runner: called in several threads where there are several runs at once. It ends what is
+                under way when `stop` is set.
             say, show: as of `make_jobs`.
         Raises:
             InputError: another process makes runs in the same folder.
@@ -153,8 +155,8 @@ class Chart:
         return f"{runs}{beside}, {about}{there}"
 
     def failures(self) -> list[dict[str, Any]]:
-        """Runs without a result, by seed, and whether this call asked for them; filtered as
-        `results`."""
+        """Runs that ended without a result, by seed, and whether this call asked for them. Those of
+        earlier settings under the same name are left out, as in `results`."""
         names = {one.key: one.name for one in self.contenders}
         asked, found = {(job.contender.key, job.seed) for job in self.jobs}, []
         for one in self.folder.failures():
@@ -206,7 +208,8 @@ class Chart:
         return {"date": today, "command": self.command, **describe_code()}
 
     def _made_of(self, stored: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-        """The same of all stored runs: the commands that made them, and their commits."""
+        """The same of all stored runs: the commands that made them, this call's last, and the
+        commits of all."""
         asked = {job.name for job in self.jobs}
         others = [one["made"]["command"] for name, one in stored.items() if name not in asked]
         commits = {one["made"]["commit"] for one in stored.values()} - {None}
@@ -222,7 +225,8 @@ class Chart:
         return results
 
     def draw(self) -> dict[str, Any]:
-        """Writes the results, and where a run has succeeded the pictures and `chart.html`."""
+        """Writes the results, and where a run has succeeded `chart.png`, light and dark, and
+        `chart.html`."""
         results = self.write()
         if results["runs"]:
             place = self.folder.path
@@ -237,8 +241,8 @@ def _counted(runs: int) -> str:
 
 
 def why_not_shared(source: Path, settings: Mapping[str, Any]) -> str | None:
-    """Why a chart with these settings cannot use the runs of another folder, or None. The suite may
-    differ. A damaged folder is an `InputError`."""
+    """Why a chart with these settings cannot use the runs of another folder; None if it can. Only
+    the suite that they were made for may differ. A damaged folder is an `InputError`."""
     file = source / SETTINGS
     if not file.is_file():
         return "there is no chart in it"
@@ -248,7 +252,8 @@ def why_not_shared(source: Path, settings: Mapping[str, Any]) -> str | None:
 
 
 def take_over(folder: RunFolder, missing: Sequence[Job], sources: Sequence[Path]) -> list[Job]:
-    """Copies missing runs, each from the first chart that has it; returns their jobs."""
+    """Copies missing runs from the folders of other charts, each from the first that has it;
+    returns their jobs."""
     left, taken = list(missing), []
     for source in sources:
         for name, record in stored_in(source).items():
@@ -264,7 +269,8 @@ def take_over(folder: RunFolder, missing: Sequence[Job], sources: Sequence[Path]
 
 
 def is_run_of(record: Mapping[str, Any], job: Job) -> bool:
-    """Whether a stored run is that of a job; one with more grids and taught gates serves too."""
+    """Whether a stored run is that of a job. One with more grids and taught gates serves too: these
+    are made from its field afterwards."""
     made = Contender.from_dict(record["contender"])
     alike = made.alone().key == job.contender.alone().key
     has_all = set(job.contender.grids) <= set(made.grids) and job.contender.taught <= made.taught

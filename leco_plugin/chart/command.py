@@ -30,9 +30,13 @@ class Asked:
     learn_seconds: float | None = None
     seeds: Sequence[int] = (0, 1, 2)
     images: int = 2
+    """Whole test images rendered by each run."""
     at_once: int | None = None
+    """Runs at a time; None is one, or as a suite has it."""
     reuse: Sequence[Path] = ()
+    """Folders of other charts on this scene, whose runs need not be made again."""
     held_out: HeldOut = "spread"
+    """Which photographs are tested."""
 
 
 def processes(chart: Chart) -> Runner:
@@ -90,6 +94,7 @@ def refuse_failures(made: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _check_shared(out: Path) -> None:
+    """Refuses a folder that holds something else than suites."""
     known = [*SUITES, *LEFT_BY_SYSTEMS]
     held = sorted(path.name for path in out.iterdir()) if out.exists() else []
     others = [name for name in held if name not in known]

@@ -105,8 +105,9 @@ def config_of(
 ) -> TrainerConfig:
     """The config of a contender's training run.
 
-    All read the scene with our parser, so that they render the same test pixels, and draw their
-    rays on the clock. A host that learns its occupancy first may do so for `learn_seconds`.
+    All contenders read the scene with our parser, so that they render the same test pixels, and
+    draw their rays on the clock. A host that learns its occupancy first may do so for
+    `learn_seconds`.
 
     Raises:
         InputError: there is no such method, its reader cannot hold out a stretch, or a process of
@@ -221,7 +222,7 @@ class Protocol:
                 raise ValueError(f"at least one of the {name} is needed, not {count}")
 
     def budget(self) -> Budget:
-        """When a run is over; `ValueError` for a time or a number of steps that is none."""
+        """When a run is over; `ValueError` for a time or a number of steps that is not positive."""
         learning = self.learn_seconds
         if learning is None and self.seconds is not None:
             learning = LEARN_SHARE * self.seconds
@@ -289,7 +290,8 @@ SLOW = Cores(step=0.45, overhead=45.0, unguided=60.0, grids=280.0, megapixel=40.
 def run_seconds(
     contender: Contender, protocol: Protocol, cores: Cores, megapixels: float = SMALL
 ) -> float:
-    """Forecast of one run with test images of so many million pixels."""
+    """Forecast of one run, from the start of its process to the end; its test images have so many
+    million pixels."""
     steps = None if protocol.steps is None else protocol.steps * cores.step
     seconds = min(end for end in (protocol.seconds, steps) if end is not None) + cores.overhead
     larger = max(0.0, megapixels - SMALL) * protocol.images * cores.megapixel
@@ -308,6 +310,7 @@ def forecast_minutes(
 
 
 def forecast(contenders: Iterable[Contender], protocol: Protocol, megapixels: float = SMALL) -> str:
+    """How long runs take, in words: on fast cores and on slow ones."""
     given = list(contenders)
     fast, slow = (
         max(1, round(forecast_minutes(given, protocol, cores, megapixels)))

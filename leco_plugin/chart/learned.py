@@ -14,7 +14,7 @@ from leco_plugin.chart.summary import Line, compare, figure_in, middle_of
 OURS = "(ours)"
 """Marks the contender that a suite asks about."""
 KEPT_WHEN_FROZEN = "at_equal_loss.kept_reached_volume"
-"""Share of what rays reach that a gate keeps at equal loss."""
+"""Share of the volume reached by rays that a gate keeps at equal loss."""
 AT_THE_END = 0.99
 """Share of the training time; a gate that is frozen later has guided nothing."""
 
@@ -41,7 +41,7 @@ class Learned(Line):
 
     @property
     def seeds(self) -> int:
-        """With a frozen gate or without."""
+        """How many there are, with a frozen gate or without."""
         return len(self.runs)
 
     @property
@@ -80,14 +80,16 @@ class Learned(Line):
 
 
 def learned_of(lines: Sequence[Line]) -> list[Learned]:
-    """Of each contender that learns an occupancy; none where no gate was ever frozen."""
+    """Of each contender that learns an occupancy with a gate, whether one was ever frozen or not;
+    none where no contender's was."""
     found = [Learned(**vars(line)) for line in lines if line.learned]
     return found if any(one.facts for one in found) else []
 
 
 def learned_headline(learned: Sequence[Learned], short: bool = False) -> str:
-    """Space kept and PSNR of ours, or of the first that always froze, and who is better in both:
-    medians of space, means of PSNR. What is short leaves out the rest of the others."""
+    """Space kept at equal loss and PSNR of ours, or of the first that always froze, and which other
+    is better in both: medians of space and means of PSNR. A short one leaves out the other others.
+    """
     known = [one for one in learned if one.is_measured]
     if not known:
         return "no gate was frozen with every seed"
@@ -151,7 +153,8 @@ FALL = 0.3
 
 
 def last_gain(line: Line) -> float | None:
-    """Mean PSNR gained in the last third of the time, dB; None where a curve begins after that."""
+    """Mean over seeds of the PSNR gained in the last third of the training time, dB; None where the
+    curve of one has no point before that."""
     gains = []
     for run in line.runs:
         seconds, psnrs = zip(*run["curve"])
@@ -194,7 +197,8 @@ def settling(lines: Sequence[Line]) -> str:
 
 
 def falls(lines: Sequence[Line]) -> str | None:
-    """Lines with runs that end more than `FALL` below their best point; None without any."""
+    """Which lines have runs that end more than `FALL` below their own best point, in how many runs,
+    and by how much at most; None without any."""
     fallen = []
     for line in lines:
         below = [max(psnr for _, psnr in run["curve"]) - run["curve"][-1][1] for run in line.runs]

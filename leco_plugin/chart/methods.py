@@ -186,8 +186,8 @@ def contender_of_host(method: str, sampler: str, host: Any) -> Contender | None:
 
 
 def _long_steps(host: Any) -> dict[str, Any] | None:
-    """Changes that give a host longer steps, of which it skips none; None for another rule of
-    steps."""
+    """Changes that give a host steps `LONGER` times as long, of which it skips none; None where it
+    has another rule for its steps."""
     if isinstance(host, SwitchNerfModelConfig):
         candidates = max(1, host.sizes.candidates // LONGER)
         return {"occupancy.sampler": DENSE, "host.sizes.candidates": candidates}
@@ -355,7 +355,8 @@ SUITES = {
 
 
 def in_order(names: Sequence[str]) -> list[str]:
-    """Names of suites in the order of `SUITES`; an `InputError` for an unknown one."""
+    """Names of suites, with `all` or not, in the order of `SUITES`; an `InputError` for an unknown
+    one."""
     for name in names:
         if name not in SUITES and name != ALL:
             listed = ", ".join(SUITES)

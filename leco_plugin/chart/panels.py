@@ -27,6 +27,7 @@ from leco_plugin.chart.summary import (
 )
 
 HELD_COSTS = {"size": "size of the occupancy, kB", "learn_seconds": LEARNING.titled}
+"""Names in `Held` of what an occupancy costs, and their titles."""
 
 
 def title_of(results: Mapping[str, Any]) -> str:

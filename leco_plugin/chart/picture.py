@@ -202,7 +202,8 @@ def _draw_front(axes: Any, panel: Panel, theme: Theme) -> None:
 
 
 def draw_curves(axes: Any, lines: Sequence[Line], theme: Theme, small: bool = False) -> None:
-    """Mean PSNR against seconds of training, seeds as a band, and the best so far of all."""
+    """Mean PSNR of each line against seconds of training, its seeds as a band, and the best so far
+    of all."""
     ends = []
     for i, line in enumerate(lines):
         look = style(i, theme)
@@ -279,7 +280,8 @@ def name_points(
     colours: Sequence[str],
     others: Sequence[tuple[float, float]] = (),
 ) -> None:
-    """Writes names beside points, where they and their lines cover least, others included."""
+    """Writes names beside points, each where it and the line to it cover least: not `others`
+    either."""
     to_panel = axes.transData + axes.transAxes.inverted()
     taken = boxes_around(to_panel.transform([*places, *others]), *POINT)
     written = np.zeros((0, 4))

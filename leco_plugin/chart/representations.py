@@ -119,7 +119,8 @@ def never_held_of(lines: Sequence[Line]) -> list[str]:
 
 
 def _held_in(run: Mapping[str, Any], line: Line) -> dict[_What, Held]:
-    """Its gate, and what was made from its field; nothing where its gate was not measured."""
+    """Its gate, what its field has taught, sparse points, and grids of densities by size; nothing
+    where its gate was not measured."""
     seconds, kept = (cost.of(run) for cost in (LEARNING, KEPT))
     if seconds is None or kept is None:
         return {}
@@ -156,7 +157,8 @@ def fronts_of(one: Representation, all_of_them: Sequence[Representation]) -> lis
 
 
 def verdict(representations: Sequence[Representation]) -> str:
-    """What of ours no cheaper occupancy beats in space, and what does: by medians of seeds."""
+    """What of ours nothing that costs no more beats in space, and what does: by medians. What the
+    seeds do not tell apart is said to be level, or undecided."""
     ours = [one for one in representations if one.ours]
     if not ours:
         return "our own gate was not frozen with every seed"
@@ -217,7 +219,8 @@ def _is_cheapest(one: Representation, others: Sequence[Representation], figure: 
 
 
 def _best_ahead(one: Representation, others: Sequence[Representation], figure: str) -> str:
-    """Of those that lead a representation, the one that keeps least."""
+    """Of those that lead a representation, the one that keeps least; and whether it is level in
+    space, where the seeds do not tell the two apart."""
     leaders = [other for other in others if other.has(figure) and other.leads(one, figure)]
     best = min(leaders, key=lambda other: other.kept)
     space = best.against(one, "kept")

@@ -58,7 +58,8 @@ def compare(ours: Sequence[float], theirs: Sequence[float], close: float | None 
     difference of their means. Where that holds zero the two are level, or, if its half is wider
     than `close`, undecided. Swap the two for a cost. `ValueError` where one has no run.
 
-    Runs with the same seed share nothing but its number, so that they are no pairs.
+    Runs with the same seed share nothing but its number, so that they are no pairs, and two
+    contenders need not scatter alike.
 
     Args:
         close: in the figure's unit, PSNR by default; of None `CLOSE_SHARE` of the mean of all.
@@ -186,7 +187,8 @@ class Line:
         return middle_of([cost.of(run) for run in self.runs])
 
     def curve(self) -> tuple[NDArray[np.float64], ...]:
-        """Mean seconds [T]; mean, lowest and highest PSNR [T] at equal shares of training."""
+        """Mean seconds [T], and mean, lowest and highest PSNR [T] over seeds, dB, at equal shares
+        of their training, the end included."""
         curves = [np.array(run["curve"], dtype=float) for run in self.runs]
         ends = np.array([curve[-1, 0] for curve in curves])
         begin = max(curve[0, 0] / end for curve, end in zip(curves, ends))
@@ -210,8 +212,8 @@ class Line:
 
 
 def seconds_to_pass(curve: Sequence[Sequence[float]], psnr: float) -> float | None:
-    """When a curve [[seconds, PSNR], ...] reaches a PSNR and stays above it, interpolated; None for
-    never. Its first seconds where no point is below."""
+    """When a curve [[seconds, PSNR], ...] reaches a PSNR and stays above it, interpolated. None for
+    never; the first point's seconds, at most, where no point is below."""
     below = [i for i, (_, value) in enumerate(curve) if value < psnr]
     if not below:
         return float(curve[0][0])
@@ -247,7 +249,8 @@ def front(points: Sequence[tuple[float, float]]) -> list[int]:
 
 
 def best_so_far(lines: Sequence[Line]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Seconds [T] of training, and the highest mean PSNR [T] of any contender by then."""
+    """The front of accuracy against training time: seconds [T], and the highest mean PSNR [T], dB,
+    that any contender has reached by then."""
     curves = [line.curve()[:2] for line in lines]
     times = np.unique(np.concatenate([seconds for seconds, _ in curves]))
     reached = [np.interp(times, seconds, psnr, left=-np.inf) for seconds, psnr in curves]
@@ -312,7 +315,8 @@ def circumstances(results: Mapping[str, Any]) -> str:
 
 
 def describe_seeds(results: Mapping[str, Any]) -> str:
-    """Seeds of a contender, and how many runs failed, as "2 to 5 seeds; 3 runs failed"."""
+    """The least and the most seeds of a contender, and how many runs failed, such as "2 to 5 seeds;
+    3 runs failed"."""
     counts = [len(line.runs) for line in lines_of(results)]
     least, most = min(counts), max(counts)
     said = "one seed" if most == 1 else f"{most} seeds" if least == most else ""

@@ -54,6 +54,7 @@ ASKED = (
     Cost("train_queries.proposal", "proposals in training", "M", 1e-6),
     Cost("train_queries.gate", "frozen gate in training", "M", 1e-6),
 )
+"""Numbers of positions at which networks were asked."""
 OCCUPANCY = (
     ("params", "parameters", 1.0),
     ("bytes", "kB", 1e-3),
@@ -68,6 +69,7 @@ OCCUPANCY = (
     ("kept_surface_recall", "true surface kept, %", 100.0),
     ("free_space_skipped", "free space skipped, %", 100.0),
 )
+"""Figure, title and scale of the columns about a learned occupancy."""
 
 
 def rows(header: Sequence[str], cells: Sequence[Sequence[str]]) -> str:
@@ -142,7 +144,8 @@ def table(results: Mapping[str, Any]) -> str:
 
 
 def runs_table(lines: Sequence[Line]) -> str:
-    """Means of quality and medians of cost, bold on the front; and which qualities no run has."""
+    """Means of quality and medians of cost over seeds, bold on the front of its column; and a line
+    on figures of quality that no run has."""
     level = common_psnr(lines)
     runs = [run for line in lines for run in line.runs]
     measured, missing = {}, []
@@ -194,7 +197,8 @@ def at_first(passed: Sequence[float | None], first: Sequence[float]) -> list[boo
 def bounded_spread(
     values: Sequence[float | None], form: str, is_bound: Sequence[bool], sign: str
 ) -> str:
-    """As `spread`, with a sign before figures that may be less ("≤") or more ("≥")."""
+    """As `spread`. Where some values are bounds, a sign stands before each figure that may be less
+    ("≤") or more ("≥")."""
     said = spread(values, form)
     known = [value for value in values if value is not None]
     bounds = [value for value, bound in zip(values, is_bound) if value is not None and bound]
@@ -217,7 +221,8 @@ def _marked(said: str, value: float, bounds: Sequence[float], sign: str) -> str:
 
 
 def versus_table(duels: Sequence[Versus]) -> str:
-    """What learned occupancies gain."""
+    """What learned occupancies gain: the verdict on PSNR, medians of times and of ratios, and the
+    least and the most."""
     return table_of(
         duels,
         {
@@ -253,7 +258,8 @@ def failures_table(failures: Sequence[Mapping[str, Any]]) -> str:
 
 
 def occupancy_table(learned: Sequence[Learned]) -> str:
-    """Medians over seeds with a frozen gate. Size and true surface kept are of the end."""
+    """Occupancies: medians over the seeds in which a gate was frozen. Size and true surface kept
+    are of the gate at the end, which may be smaller than the one that was frozen."""
 
     def frozen(one: Learned) -> str:
         late = f", {one.guided_nothing} at the end" if one.guided_nothing else ""
@@ -305,7 +311,7 @@ def left_out(lines: Sequence[Line]) -> list[str]:
 
 
 def provenance(results: Mapping[str, Any]) -> str:
-    """When, how and by which code the runs were made."""
+    """When, how and by which code the runs were made, and whether it was the same for all."""
     made, runs = results["made"], results["runs"]
     commit = f" at {made['commit']}" if made["commit"] else ""
     said = f"`{made['command']}`, {made['date']}, leco_plugin {made['version']}{commit}."

@@ -32,6 +32,7 @@ SMALL_GATES = {
 TAUGHT_GRIDS = (32, 64, 128, 256)
 """Cells along an axis of grids that are taught as small gates are."""
 BYTES_A_POINT = 6
+"""Its three numbers in half precision."""
 
 
 def run_job(
@@ -133,8 +134,8 @@ def compare_at_freezing(model: Any, datamanager: Any, contender: Contender) -> d
     Returns:
         As `at_equal_loss`. For a contender with small gates, `taught` holds for each of
         `SMALL_GATES` its `name`, `bytes`, `seconds` of teaching and what it keeps; `others` the
-        same of grids that had the same lesson, and of what lies near the scene's sparse points.
-        `learned_first` says whether the field is needed.
+        same of grids that had the same lesson, and of the scene's sparse points, where what lies
+        near one is kept. `learned_first` says whether the field is needed.
     Raises:
         ValueError: held-out rays see no surface.
     """
