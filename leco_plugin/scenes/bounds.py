@@ -1,7 +1,8 @@
 """Where a scene lies, found from cameras and sparse points: its mapping and the rays' range.
 
-A scene photographed from above is bounded, between a plane above and one below all points, as
-Mega-NeRF does it. Everything else is contracted, with the points in the uncontracted cube.
+A scene photographed from above is bounded: its rays are cut at a plane above and one below all
+points, as Mega-NeRF cuts them by altitude. Everything else is contracted, with the points in the
+uncontracted cube. Either choice can be made by hand.
 """
 
 from __future__ import annotations
@@ -108,7 +109,8 @@ def find_bounds(
 
 
 def usable_points(points: Tensor | None) -> Tensor | None:
-    """The finite ones of sparse points [P, 3], float32 on the CPU; None of too few."""
+    """The finite ones of sparse points [P, 3], float32 on the CPU; None if they are fewer than
+    `FEWEST_POINTS`."""
     if points is None:
         return None
     points = points.detach().float().cpu()
@@ -117,7 +119,8 @@ def usable_points(points: Tensor | None) -> Tensor | None:
 
 
 def with_range(bounds: SceneBounds, near: float | None, far: float | None) -> SceneBounds:
-    """The bounds with near and far, if set by hand. InputError for an empty range, or near 0."""
+    """The bounds with near and far set by hand; None leaves what was found. InputError for an empty
+    range, or one that begins at the camera."""
     near, far = bounds.near if near is None else near, bounds.far if far is None else far
     if not 0.0 < near < far < math.inf:
         raise InputError(f"rays need 0 < near < far, got near {near:g} and far {far:g}")
@@ -125,8 +128,11 @@ def with_range(bounds: SceneBounds, near: float | None, far: float | None) -> Sc
 
 
 def raise_to_cameras(bounds: SceneBounds, heights: Tensor, seen: float) -> SceneBounds:
-    """The bounds of a scene from above, raised to its cameras, of heights z [C]: where rays beyond
-    show something (`seen`, a share of all), as fog, which has no points, or a sky."""
+    """The bounds of a scene from above, raised to its cameras, of heights z [C].
+
+    It is for pictures in which rays that miss what the sparse points bound show something (`seen`,
+    a share of all rays): fog, which has no points, or a sky.
+    """
     ground, highest = float(bounds.aabb[2]), float(heights.max())
     top = max(float(bounds.aabb[5]), highest + OVER_CAMERAS * (highest - ground))
     x, y = bounds.center[:2].tolist()
@@ -189,7 +195,7 @@ def _room(poses: Tensor, low: Tensor, high: Tensor, near: float, far: float) -> 
     """A bounded scene with walls around its points and its cameras."""
     places = poses[:, :, 3]
     low, high = torch.minimum(low, places.amin(dim=0)), torch.maximum(high, places.amax(dim=0))
-    margin = 0.125 * float((high - low).max())  # an eighth
+    margin = 0.125 * float((high - low).max())  # an eighth of the longest side
     low, high = low - margin, high + margin
     half = float((high - low).max()) / 2
     reason = "as configured: bounded, rays cut at walls around points and cameras"
@@ -243,7 +249,8 @@ MOSTLY_ABOVE, MOSTLY_DOWN = 0.75, 0.9
 
 
 def _seen_from_above(poses: Tensor, directions: Tensor, points: Tensor) -> tuple[bool, str]:
-    """Whether rays go down and cameras are above points as in a survey; both shares in words."""
+    """Whether nearly all rays go down and most cameras are above nearly all points, and both shares
+    in words."""
     above = float((poses[:, 2, 3] > _quantiles(points[:, 2], 0.95)).float().mean())
     down = float(_go_down(directions).float().mean())
     words = f"{down:.0%} of rays go down, {above:.0%} of cameras are above the points"

@@ -52,7 +52,8 @@ def description_of_run(file: Path) -> Path | None:
 
 
 def _data_named_in(config: Path) -> Path | None:
-    """The data that a run's config.yml names, or None. Nothing in it is executed."""
+    """The data that a run's config.yml names; None where it cannot be read. Nothing in it is
+    executed, and classes that this version lacks do not matter."""
     import yaml
 
     class Plain(yaml.SafeLoader):
@@ -103,7 +104,8 @@ def read_cloud(path: Path) -> CloudFile:
 
 
 def coloured_points(description: Path) -> ColouredPoints | None:
-    """Sparse points with colours that a transforms.json names, or None; or as `read_cloud`."""
+    """Sparse points with colours that a transforms.json names, or None. InputError if they cannot
+    be read."""
     name = load_json(description).get("ply_file_path")
     path = description.parent / str(name)
     if name is None or not path.is_file():
@@ -140,7 +142,7 @@ PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "P
 
 def views_of(description: Path, places: NDArray[np.float64]) -> NDArray[np.int64] | None:
     """How many photographs of a transforms.json may show places [N, 3], whatever hides them: [N];
-    None where it does not say by which lens, or that is no pinhole."""
+    None where it does not say how they were taken, or by a lens that sees around corners."""
     meta = load_json(description)
     counts = np.zeros(len(places), dtype=np.int64)
     try:
@@ -170,7 +172,8 @@ def views_of(description: Path, places: NDArray[np.float64]) -> NDArray[np.int64
 def _bend(
     slopes: NDArray[np.float64], k1: float, k2: float
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Slopes [N, 2] as radial distortion of a lens bends them, and whether it folds there: [N]."""
+    """Slopes [N, 2] as a lens with radial distortion bends them, and whether it is folded there, so
+    that they lie further out than its image goes: [N]."""
     squares = (slopes**2).sum(axis=1)
     factor = 1.0 + k1 * squares + k2 * squares**2
     return slopes * factor[:, None], 1.0 + 3.0 * k1 * squares + 5.0 * k2 * squares**2 <= 0.0

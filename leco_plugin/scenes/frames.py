@@ -178,7 +178,8 @@ class DatasetUnits:
 
 def units_of(datamanager: Any, metres_per_unit: float | None = None) -> DatasetUnits | None:
     """The units of a data manager's dataset; None where its dataparser does not say what it did.
-    `metres_per_unit` of its poses goes before what that knows; InputError if it is not positive."""
+    `metres_per_unit` of its poses goes before what the dataparser knows; InputError if it is not
+    positive."""
     outputs = getattr(datamanager, "train_dataparser_outputs", None)
     scale = float(getattr(outputs, "dataparser_scale", 0.0))
     if outputs is None or not 0.0 < scale < math.inf:
@@ -202,7 +203,8 @@ SKEW = 0.05
 
 
 def distance_from_rotations(matrices: NDArray[np.floating]) -> NDArray[np.floating]:
-    """How far finite [C, 3, 3] are from R R^T = 1 and det R = 1: [C]."""
+    """How far finite [C, 3, 3] are from rotations: the largest error of R R^T = 1 and of det R = 1,
+    [C]; a mirrored rotation has 2."""
     errors = np.abs(matrices @ matrices.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
     return np.maximum(errors, np.abs(np.linalg.det(matrices) - 1.0))
 
@@ -240,14 +242,16 @@ point, if they are turned at all, and with the vertical, if they are level."""
 ONE_HEADING = 0.7
 """Length of the mean of the cameras' top axes: with more, all are held alike."""
 WIDE = 0.3
-"""Least spread of cameras over a survey, of their height: before a wall it is less."""
+"""Least spread of cameras over a survey, as a share of their height: cameras of somebody who stands
+before a wall, and holds all photographs alike, are closer together."""
 
 
 def turn_to_upright(poses: Tensor, points: Tensor | None) -> Tensor | None:
     """The rotation [3, 3] that sets a survey from the air upright; None if it is, or is no survey.
 
-    Up is over a flat ground, where right axes are level, or across the layer in which cameras fly,
-    whichever is known. Poses are [C, 3, 4] OpenGL's, points [P, 3] or None.
+    Up is away from a flat ground, at a right angle to the cameras' right axes, which are level, or
+    across the layer in which they fly, whichever is known. Poses are [C, 3, 4] OpenGL's, points
+    [P, 3] or None.
     """
     poses = poses.detach().double().cpu()
     looks, places = -poses[:, :, 2], poses[:, :, 3]
@@ -300,7 +304,8 @@ def _without_strays(points: Tensor) -> Tensor | None:
 
 
 def _spreads(places: Tensor) -> tuple[Tensor, Tensor]:
-    """Standard deviations [3] of places [N, 3] along principal axes, least first; these [3, 3]."""
+    """Standard deviations [3] of places [N, 3] along their principal axes, least first, and the
+    axes as columns [3, 3]."""
     values, axes = torch.linalg.eigh(torch.cov(places.T))
     return values.clamp(min=0.0).sqrt(), axes
 

@@ -13,8 +13,8 @@ class InputError(ValueError):
 
 
 class TrainingStopped(RuntimeError):
-    """A run cannot go on; the message says at which step, why, and what is left of it. A loop of
-    one's own can catch it; `ns-*` commands end with its one line and status 1."""
+    """A run cannot go on; the message says at which step, why, and what is left of it. A training
+    loop can catch it; `ns-*` commands end with its one line and status 1 (`studio.commands`)."""
 
 
 ANOTHER_VERSION = (

@@ -141,7 +141,8 @@ class ReadsNear(DataParser):
 
 
 def near_bases(kind: type[DataParser]) -> tuple[type[DataParser], ...]:
-    """Bases of a class like this one, with `ReadsNear` before the reader of its poses, if known."""
+    """Bases of a class like this one, with `ReadsNear` before the reader that it takes its poses
+    from; the class itself where that is not known."""
     for owner in kind.__mro__ if not issubclass(kind, ReadsNear) else ():
         read = vars(owner).get("_generate_dataparser_outputs")
         if SEAMS & {*getattr(getattr(read, "__code__", None), "co_names", ())}:

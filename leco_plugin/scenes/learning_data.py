@@ -134,7 +134,8 @@ class LearningData:
         return held_out_rays(mixture, self.manager, count, seed, share)
 
     def training_rays(self, mixture: Mixture, count: int, set_aside: int = 0) -> Rays:
-        """Rays of random training pixels, cut to a region; `set_aside` is for this draw only."""
+        """Rays [count] of random training pixels, cut to a mixture's region. `set_aside` is as of
+        `prepare_batch`, and for this draw only."""
         self.prepare_batch(1.0, distances=False, set_aside=set_aside)
         drawn: list[Rays] = []
         for bundle in training_bundles(self.manager, count):
@@ -186,7 +187,8 @@ def held_out_bundle(
     """Up to `count` rays of pixels that are never trained on, and true colours [R, 3 or 4].
 
     They are of training images, whose appearance is known: an unknown exposure would stand in every
-    error. A data manager without held-out pixels gives training rays; the report says so.
+    error, and hide what skipping adds to it. A data manager without held-out pixels gives ordinary
+    training rays; the report says so.
     """
     if (sampler := held_out_sampler(manager)) is None:
         bundle, batch = manager.next_train(0)

@@ -52,7 +52,8 @@ class Lens:
     def focal_lengths(
         self, width: float, height: float, factor: int
     ) -> tuple[float, float] | tuple[None, None]:
-        """Focal lengths in pixels of a picture, smaller by `factor` than the lens, if known."""
+        """Both focal lengths in pixels of a picture of that size, smaller by `factor` than the lens
+        is for; None where nothing is said."""
         across = self.fx, self.angle_x, width if self.width is None else self.width / factor
         down = self.fy, self.angle_y, height if self.height is None else self.height / factor
         found = [
@@ -64,8 +65,8 @@ class Lens:
 
 
 def lens_of(meta: dict[str, Any], frame: dict[str, Any], where: str) -> Lens:
-    """The lens of a frame, or else of its scene. InputError, with `where` that is,
-    for a number that is none, or a lens that nerfstudio lacks."""
+    """The lens of a frame: what it says goes before what its scene says. InputError, with `where`
+    that is, for a number that is none, or a lens that nerfstudio lacks."""
 
     def said(name: str, positive: bool = True) -> float | None:
         value = frame.get(name, meta.get(name))
@@ -113,7 +114,8 @@ def set_lenses(cameras: Cameras, lenses: list[Lens | None], factor: int) -> None
 
 
 def check_together(lenses: list[Lens], where: str) -> None:
-    """InputError if frames mix types other than perspective and fisheye, or circles of fisheyes."""
+    """InputError if frames mix other types than perspective and fisheye, or if their fisheyes show
+    circles of several sizes."""
     kinds = {lens.kind or CameraType.PERSPECTIVE for lens in lenses}
     if len(kinds) > 1 and not kinds <= MIXED:
         names = " and ".join(sorted(kind.name for kind in kinds))

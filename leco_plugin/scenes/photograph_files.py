@@ -163,7 +163,8 @@ def is_turned(header: Header, size: tuple[int, int]) -> bool:
 
 
 def decode(path: Path, turn: bool) -> Image.Image:
-    """The plain colours and the EXIF of an image, turned as that says if asked; or InputError."""
+    """The plain colours of an image, turned as EXIF says if asked; its EXIF stays as it was.
+    InputError if it cannot be read."""
     try:
         with opened(path) as image:
             image.load()  # Pillow itself turns TIFF here
@@ -176,7 +177,8 @@ def decode(path: Path, turn: bool) -> Image.Image:
 
 
 def names_what_it_cannot_read(dataset: Any) -> Any:
-    """A dataset of nerfstudio's, whose InputError names an image that cannot be read."""
+    """A dataset of nerfstudio's. Where an image or what comes with it cannot be read, an InputError
+    names the image in one line."""
     read, paths = dataset.get_data, dataset.image_filenames
 
     def read_or_name(image_idx: int, *arguments: Any, **options: Any) -> Any:
@@ -195,7 +197,8 @@ def names_what_it_cannot_read(dataset: Any) -> Any:
 
 class DerivedImages:
     """A folder of PNG files that are made when they are first asked for, and again once their
-    source has changed. `remedy` is for where nothing can be written."""
+    source (path, size, time of change) or the recipe has changed. `remedy` is what to do where
+    nothing can be written."""
 
     def __init__(
         self, folder: Path, remedy: str = "give another folder for derived pictures with --cache"
@@ -276,7 +279,8 @@ def convert_masks(
 
 
 def seen_pixels(mask: Path, image: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """The pixels [H, W] that a mask shows of an image of this width and height; or InputError."""
+    """The pixels [H, W] that a mask shows of an image of this width and height. InputError if it
+    cannot be read, has colours or another size."""
     path = _found(mask, image)
     return _fit(_is_seen(_values(path)), size, path)
 
@@ -295,7 +299,8 @@ def _found(path: Path, image: Path) -> Path:
 
 
 def _values(path: Path) -> NDArray[np.uint8]:
-    """How light each pixel of a mask is: [H, W], 0 to 255, transparent ones 0; or InputError."""
+    """How light each pixel of a mask is: [H, W], 0 to 255, transparent ones 0. InputError if it
+    cannot be read, or has colours."""
     try:
         with Image.open(path) as image:
             if image.mode in ("1", "L") and "transparency" not in image.info:
@@ -320,7 +325,8 @@ def _is_seen(values: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 
 def _fit(seen: NDArray[np.bool_], size: tuple[int, int], path: Path) -> NDArray[np.bool_]:
-    """The pixels of a mask that has its image's size, or a multiple; else InputError."""
+    """The pixels of a mask that has its image's size, or a whole number of times that. InputError
+    if it has another size."""
     high, wide = seen.shape
     if (wide, high) == size:
         return seen

@@ -134,8 +134,8 @@ def read_scene(data: Path) -> SceneFile:
 
 
 def read_points(meta: dict[str, Any], folder: Path) -> CloudFile | None:
-    """Sparse points in the coordinates of the file, or None; said where a file of them is named
-    that is not there or empty. InputError if it cannot be read."""
+    """Sparse points in the coordinates of the file, or None. A file that is named and not there, or
+    empty, is said, for learning without points is slower. InputError if it cannot be read."""
     name = meta.get("ply_file_path")
     if name is None:
         return None
@@ -197,8 +197,12 @@ TRAINED = 0.5
 
 def find_stretch(positions: Array) -> tuple[list[int], list[int]]:
     """The stretch of cameras at [C, 3] near the middle that ends with the widest gap, and those
-    beside it, by number. It grows by the nearest camera each time, and so follows a line or an arc.
-    ValueError if there are too few cameras, or they stand too close together."""
+    beside it, by number.
+
+    It grows from the camera next to the middle, by the nearest camera each time. So it follows a
+    line or an arc whose cameras are nearer to each other than to those of the next line. ValueError
+    if there are too few cameras, or they stand too close together.
+    """
     if (count := len(positions)) < FEWEST:
         few = f"there are {count} cameras"
         raise ValueError(f"{few}, and a stretch is held out of {FEWEST} or more")

@@ -23,7 +23,8 @@ class Refused(Exception):
 
 
 def read_pt(path: Path, most_bytes: int = 1 << 20) -> Any:
-    """What a .pt file holds: tensors, numbers, strings, containers of them. Else InputError."""
+    """What a .pt file holds: tensors, numbers, strings and containers of them. InputError if it
+    holds anything else, cannot be read, is damaged or larger than `most_bytes`."""
     return load(read_bytes(path, most_bytes), str(path))
 
 

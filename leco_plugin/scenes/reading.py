@@ -1,5 +1,8 @@
-"""What all readers of scenes pass: their pictures, masks and lenses, and their errors. Each checks
-something else, so that what is read wrongly is looked for in what they return."""
+"""What all readers of scenes pass: their pictures, masks and lenses, and their errors.
+
+nerfstudio has some fifteen readers, and packages add more. Each checks something else, so that what
+is read wrongly is looked for in what they return.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +35,8 @@ UNWRITABLE = "make the folder of the scene writable, or convert its pictures and
 
 
 class CheckedReader(DataParser):
-    """Stands before a reader among the bases of a class: checks outputs, errors are one line."""
+    """Stands before a reader among the bases of a class: its outputs are checked, and each of its
+    errors is one line."""
 
     def __init__(self, config: base_dataparser.DataParserConfig) -> None:
         super().__init__(config)
@@ -212,8 +216,8 @@ def _check_focal_lengths(cameras: Cameras, images: list[Path]) -> None:
 def _size_of(
     path: Path, header: Header, lens: Lens | None, wanted: list[int], factor: int
 ) -> tuple[int, int]:
-    """Width and height of a picture as it will be read. InputError unless its lens has them, or is
-    without a size and they are those `wanted`."""
+    """Width and height of a picture as it will be read. InputError unless they are those of its
+    lens or, where that has none, those `wanted` for its camera."""
     slack = 1
     if lens is not None and lens.width is not None and lens.height is not None:
         wanted = [int(lens.width) // factor, int(lens.height) // factor]

@@ -62,7 +62,8 @@ def file_in(data: Path) -> Path:
 
 
 def load_json(path: Path) -> Any:
-    """What a JSON file says, without nulls, poses completed to four rows."""
+    """What a JSON file says, with or without a byte order mark. Nulls are left out, and poses of
+    three rows have the fourth."""
     said = _parsed(path.read_bytes())
     if not isinstance(said, dict):
         return said
@@ -180,7 +181,8 @@ def _add(scene: SceneFile, data: Path) -> str:
 
 
 def frames_of(images: list[Path], scene: SceneFile) -> list[int | None]:
-    """The number of each picture's frame. InputError if frames of several folders share one."""
+    """The number of the frame of each picture, which may be a smaller one of the same name; None
+    where no frame has it. InputError if frames of several folders would share a smaller picture."""
     places = [str(frame["file_path"]).replace("\\", "/") for frame in scene.frames]
     named: dict[str, list[int]] = {}
     for number, place in enumerate(places):
@@ -224,7 +226,8 @@ NEEDLESS = {
     *("geographic_origin", "importance_sampling", "integer_depth_scale", "n_extra_learnable_dims"),
     *("offset", "render_aabb", "scale", "sharpness", "timestamp"),
 }
-"""Neither geometry nor colour depends on them: bounds come from cameras and points."""
+"""Neither geometry nor colour depends on them: bounds come from cameras and points, and our methods
+learn without depths."""
 
 
 def unused_fields(meta: dict[str, Any]) -> list[str]:

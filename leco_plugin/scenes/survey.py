@@ -126,8 +126,8 @@ def survey(
     far: float | None = None,
 ) -> Survey:
     """Looks at the training cameras of a nerfstudio data manager; near and far, scene units, are
-    found where they are None. InputError if there is no camera, no ray meets the
-    scene, or for a wrong range."""
+    found from the data where they are None. InputError if it hands out whole images or has no
+    camera, no ray meets the scene, or what is configured is no range."""
     if hasattr(datamanager, "train_unseen_cameras"):
         kind = type(datamanager).__name__
         raise InputError(
@@ -273,8 +273,9 @@ def detail_of(
 
 
 def _pixels_on_surface(places: Tensor, density: Tensor, size: float) -> float:
-    """The density of pixels [P], integrated over the surface on which places [P, 3] lie: a side of
-    each cell that it crosses, of at least `size`, and so large that most hold `NEIGHBOURS`."""
+    """The density of pixels [P], integrated over the surface on which places [P, 3] lie: as large
+    as one side of each cubic cell that it passes through, of at least `size`, and just large enough
+    for most to hold `NEIGHBOURS` places."""
     low = places.amin(dim=0)
     widest = max(size, float((places.amax(dim=0) - low).max()))
     while True:
@@ -289,7 +290,8 @@ def _pixels_on_surface(places: Tensor, density: Tensor, size: float) -> float:
 
 def _pixel_density(places: Tensor, pose: Tensor, rays: Tensor, width: int) -> Tensor:
     """Pixels of a camera (pose [3, 4], unit rays [K, 3] that cover its image, width in pixels) for
-    a unit of area that faces it at places [P, 3]: [P], 0 outside of the image."""
+    a unit of area that faces it at places [P, 3]: one over the square of a pixel's footprint, [P];
+    0 outside of the image."""
     turn = pose[:, :3]
     local = rays @ turn
     # behind a fisheye's axis there is no tangent

@@ -1,4 +1,5 @@
-"""Files that are whole once they have their names; and whether one may be written at all."""
+"""Files that appear under their names only when they are whole, however a process ends; and whether
+one may be written, before work that takes minutes."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar"}
 
 
 def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Lets `write` fill a file beside `path`, and moves it there; the last of several wins."""
+    """Lets `write` fill a file beside `path`, and moves it there; folders are made. Of several
+    processes at once the last one wins."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}{PART}")
     try:
@@ -30,7 +32,8 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
 
 def write_json(path: Path, value: Any, indent: int = 2, allow_nan: bool = False) -> None:
-    """Writes JSON whole or not at all. NaN and infinity raise ValueError unless allowed."""
+    """Writes JSON whole or not at all; folders are made. NaN and infinity raise ValueError unless
+    allowed."""
     text = json.dumps(value, indent=indent, allow_nan=allow_nan) + "\n"
     write_whole(path, lambda file: file.write(text.encode()))
 
@@ -75,7 +78,8 @@ def check_place(option: str, path: Path | None) -> None:
 
 
 def check_picture(option: str, path: Path | None, moving: bool = False) -> None:
-    """As `check_place`, and for an unknown kind of picture; `moving` ones may be a .gif, too."""
+    """As `check_place`; ValueError too for an unknown kind of picture. A `moving` one may be a
+    .gif."""
     check_place(option, path)
     if path is None:
         return

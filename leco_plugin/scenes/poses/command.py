@@ -120,7 +120,8 @@ def _read(file: Path) -> dict[str, Any] | None:
 
 
 def _finished(out: Path, asked: dict[str, Any]) -> dict[str, Any] | None:
-    """The report of a finished scene, or None. InputError if the folder holds something else."""
+    """The report of a finished scene; None of one that is to be made or to go on. InputError if the
+    folder holds something else."""
     found = _read(out / ASKED)
     if found is None:
         if out.exists() and (not out.is_dir() or {each.name for each in out.iterdir()} - {LOCK}):

@@ -71,9 +71,11 @@ def local_places(
 
 
 def upright(poses: Array, points: Array) -> Array:
-    """The direction [3] that is up in a reconstruction of OpenGL poses [C, 3, 4] and points [P, 3]:
-    for others than surveys from the air the mean of the photographs' top edges, or against the mean
-    view where these point in all directions."""
+    """The direction [3] that is up in a reconstruction of OpenGL poses [C, 3, 4] and points [P, 3].
+
+    Of surveys from the air it is seen from ground and cameras. Of others it is the mean of the
+    photographs' top edges, or against the mean view where these point in all directions.
+    """
     # a survey that lies within 20 degrees of upright is not turned: laid down, it is
     for base in (np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.eye(3)):
         turn = turn_to_upright(torch.from_numpy(base @ poses), torch.from_numpy(points @ base.T))
@@ -89,8 +91,9 @@ def place(
 ) -> Placement:
     """The similarity that takes a reconstruction to metres, or a rotation that sets it upright.
 
-    Of camera centres [C, 3] with positions by GPS [C, 3] in metres, or nan, and what is up [3]; the
-    mean `top` [3] of photographs has a word where GPS would turn it upside down.
+    Of camera centres [C, 3] with positions by GPS [C, 3] in metres, nan where not known; a flight
+    along one line also needs what is up [3] in the reconstruction. The mean `top` [3] of the
+    photographs' top edges, if given, has a word where GPS would turn that upside down.
     """
     there = np.isfinite(gps).all(axis=1)
     known, count = gps[there], int(there.sum())
@@ -124,7 +127,8 @@ def place(
 
 def _is_mirrored(turn: Array, places: Array, up: Array, top: Array | None, width: float) -> bool:
     """Whether a turn [3, 3] to places [N, 3] in a plane, `width` metres off, puts what is up [3]
-    down. A mean `top` [3] of photographs that then points up says no: those cameras look up."""
+    down. Other places, on a line or solid, say nothing of it. A mean `top` [3] of photographs that
+    then points up says no: those cameras look up."""
     away = places - places.mean(axis=0)
     spread = np.linalg.svd(away, compute_uv=False) / np.sqrt(len(places))
     lies_in_a_plane = spread[1] > width > spread[2]
@@ -138,8 +142,8 @@ def tolerance(spread: float) -> float:
 
 
 def roll_upright(turn: Array, places: Array, up: Array, width: float) -> Array:
-    """A rotation [3, 3] to places [N, 3], rolled about their line so that `up` goes up; the same if
-    they are wider than `width` metres across."""
+    """A rotation [3, 3], rolled about the line of flight so that `up` goes up: places [N, 3] on a
+    line say nothing of that roll. It stays for places wider than `width` metres across."""
     _, lengths, axes = np.linalg.svd(places - places.mean(axis=0), full_matrices=False)
     if lengths[1] / np.sqrt(len(places)) > width:
         return turn

@@ -61,7 +61,8 @@ def read_exif(image: Image.Image) -> Exif:
 
 def focal_length(details: Mapping[int, Any], size: tuple[int, int]) -> float | None:
     """Focal length over the longest side of a picture of a width and height. The 35 mm equivalent
-    goes before the sensor's resolution, which is that of the picture as taken."""
+    goes before the sensor's resolution, which is that of the picture as taken, not of one made
+    smaller."""
 
     def said(tag: ExifTags.Base) -> float:
         return _number(details.get(tag))
@@ -125,7 +126,8 @@ KINDS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", *HEIC)
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf")
 FILMS = (".mp4", ".mov", ".avi", ".mkv", ".m4v")
 COPIED = {"JPEG": (".jpg", ".jpeg"), "MPO": (".jpg", ".jpeg"), "PNG": (".png",)}
-"""Pillow's names of kinds, and endings, of files that are copied where colours need no change."""
+"""Kinds, by Pillow's name, that are copied byte by byte where their colours need no change and
+their names end so: pycolmap reads no other."""
 SCAN, DESCRIPTIONS = 0xDA, (*range(0xE0, 0xF0), 0xFE)
 """Markers in a JPEG: where pixels begin, and segments of applications, EXIF's, and comments."""
 FEWEST = 3
@@ -297,8 +299,9 @@ def _read(path: Path, folder: Path) -> Photograph:
 
 
 def copy_photographs(found: Found, folder: Path, show: Callable[[float], None]) -> Found:
-    """Writes the copies that are missing; `show` takes the share done. Returns what was found
-    without what cannot be decoded. InputError as `_enough`, or if a copy cannot be written."""
+    """Writes the copies that are missing; `show` takes the share that is done. Returns what was
+    found without what cannot be decoded. InputError if fewer than three photographs are left, or a
+    copy cannot be written."""
     photographs, refused = [], dict(found.refused)
     for number, photograph in enumerate(found.photographs):
         copy = folder / photograph.name
@@ -326,7 +329,8 @@ def _write(photograph: Photograph, image: Image.Image, path: Path) -> None:
 
 
 def _upright_exif(image: Image.Image, kind: str) -> bytes:
-    """EXIF of an image that has been turned upright; only that, if more cannot be written."""
+    """EXIF of an image that has been turned upright. Where it cannot be written, or is too long for
+    a JPEG, it says nothing but that the image is upright."""
     upright = Image.Exif()
     upright[ExifTags.Base.Orientation] = 1
     with suppress(Exception):  # tags of another type than the standard's raise many errors

@@ -1,6 +1,7 @@
 """Structure from motion by pycolmap, on the CPU: features, matches and models.
 
-The database keeps features and matches for the next run, if one is killed; the mapping begins anew.
+The database keeps features and matches: a run that goes on after it was killed makes those that are
+missing. Only the mapping begins anew.
 Compared are photographs that are near by GPS, next ones in order, or all.
 """
 
@@ -200,7 +201,8 @@ NEIGHBOURS = 16
 WIDE = 20.0
 """Metres from their middle, in the median, from which on positions tell who sees the same."""
 ASTRAY = 0.7
-"""Median distance of next ones, over that of any two, from which on GPS contradicts order."""
+"""Median distance of one photograph to the next in order, as a multiple of that of any two, from
+which on order and GPS contradict each other."""
 NEXT = 10
 """Photographs in order that each is compared with, and one at each power of two beyond."""
 ANCHORS = 100
@@ -266,7 +268,8 @@ def choose_posed_pairs(poses: NDArray[np.float64]) -> Pairs:
 
 
 def capture_order(names: Sequence[str], exifs: Sequence[Exif]) -> list[int] | None:
-    """Numbers of the photographs as taken, by EXIF's time or as names count; None if untold."""
+    """Numbers of the photographs as they were taken, by EXIF's time or as names count; None if
+    neither tells."""
     times = [each.time for each in exifs if each.time is not None]
     if len(times) == len(names) and 2 * len(set(times)) > len(names):
         return sorted(range(len(names)), key=lambda number: (exifs[number].time, names[number]))
