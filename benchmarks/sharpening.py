@@ -119,7 +119,7 @@ def taught_by(source: Source, mixture: Mixture) -> dict[str, Any]:
         lesson = lesson_by(mixture, taught, losses, 1.0, 1024)
         of_seed = {}
         for name, (_, score) in grids_of(mixture, lesson).items():
-            measured = calibrate(on_held_out.asked(score), calibration)
+            measured = calibrate(on_held_out.asked(score), calibration, spent=mixture.report)
             after = measure(on_tests.asked(score), measured.threshold)
             of_seed[name] = {"held_out": shown(measured), "test": shown(after)}
         grids.append(of_seed)

@@ -21,23 +21,19 @@ from leco_plugin.hosts.guide import Guide
 from leco_plugin.hosts.host_watch import squared_errors
 from leco_plugin.hosts.stand_ins import GuidedEstimator
 from leco_plugin.learning.calibration import (
+    ERRORS,
+    LOSSES,
     THRESHOLDS,
     CalibrationConfig,
     Measured,
+    added_costs,
     image_price,
     measure,
 )
 from leco_plugin.learning.dense import DenseRendering, Reference, evaluating, near_surface
 from leco_plugin.learning.freezing import leave_file
 from leco_plugin.learning.run import Run
-from leco_plugin.learning.sharpening import (
-    ERRORS,
-    LOSSES,
-    SharpeningConfig,
-    added_costs,
-    lesson_of,
-    teach,
-)
+from leco_plugin.learning.sharpening import SharpeningConfig, lesson_of, teach
 from leco_plugin.log import note, say
 from leco_plugin.models.compute.device import fast_precision
 from leco_plugin.models.gate import Gate

@@ -7,14 +7,16 @@ The reference is a dense rendering. Skipping every sample with o(x) < tau loses 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from leco_plugin.learning.dense import DenseRendering, Reference
+from leco_plugin.occupancy import CAMERAS_THAT_VOUCH
 from leco_plugin.samplers.packed import accumulate_along_rays
 from leco_plugin.scenes.input_error import require
 
@@ -111,6 +113,21 @@ class Measured(NamedTuple):
         )
 
 
+LOSSES = ("lost_surface_mass", "lost_mass", "image_price_db")
+"""What a report says that skipping costs."""
+ERRORS = ("surface_error", "price_error_db")
+"""Standard errors of those."""
+NOTHING: Mapping[str, Any] = MappingProxyType({})
+"""A report by which nothing was skipped so far."""
+
+
+def added_costs(found: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, float]:
+    """What skipping costs on top of what earlier skipping has cost, and standard errors."""
+    known = {name: float(before.get(name, 0.0)) for name in (*LOSSES, *ERRORS)}
+    costs = {name: max(0.0, found[name]) + max(0.0, known[name]) for name in LOSSES}
+    return costs | {name: math.hypot(found[name], known[name]) for name in ERRORS}
+
+
 def worst_loss(cameras: Sequence[Reference], threshold: float) -> float:
     """The largest share of its weight near surfaces that any of some photographs, densely rendered,
     loses by skipping below `threshold`; 0 of none. It never falls as the threshold rises."""
@@ -122,8 +139,14 @@ def worst_loss(cameras: Sequence[Reference], threshold: float) -> float:
     return max(losses)
 
 
-def promise(cameras: Sequence[Reference], measured: Measured, config: CalibrationConfig) -> Any:
+def promise(
+    cameras: Sequence[Reference],
+    measured: Measured,
+    config: CalibrationConfig,
+    spent: Mapping[str, Any] = NOTHING,
+) -> Any:
     """What a report says of photographs that vouch, as JSON values; None where none does.
+    `spent` is as of `calibrate`: what the worst of them has lost so far is added.
 
     Were photographs drawn at random, another one would lose more than the worst of K with a chance
     of 1 in K + 1 at most, because a loss never falls as the threshold rises: split conformal
@@ -131,13 +154,18 @@ def promise(cameras: Sequence[Reference], measured: Measured, config: Calibratio
     """
     if not cameras:
         return None
-    worst = worst_loss(cameras, measured.threshold)
+    worst = worst_loss(cameras, measured.threshold) + _worst_so_far(spent)
     return {
         "count": len(cameras),
         "worst_surface_mass": worst,
         "bound": max(worst, config.camera_surface_mass),
         "confidence": round(len(cameras) / (len(cameras) + 1), 3),
     }
+
+
+def _worst_so_far(spent: Mapping[str, Any]) -> float:
+    """What the worst photograph that vouches has lost by a report; 0 where none is named."""
+    return float((spent.get(CAMERAS_THAT_VOUCH) or {}).get("worst_surface_mass", 0.0))
 
 
 class RayPrices(NamedTuple):
@@ -271,6 +299,7 @@ def calibrate(
     below: float = 1.0,
     missed_only: bool = False,
     cameras: Sequence[Reference] = (),
+    spent: Mapping[str, Any] = NOTHING,
 ) -> Measured:
     """The largest threshold of `THRESHOLDS` within the bounds, with what it costs.
 
@@ -280,18 +309,24 @@ def calibrate(
     Args:
         cameras: dense renderings of photographs that vouch. By the threshold none of them loses
             too much, see `worst_loss`, where that keeps no more than `MORE_KEPT` times as much.
+        spent: the report of what has skipped so far, if prices are of skipping more than that. Both
+            together are held to the bounds.
     """
-    best = None
+
+    def within(found: Measured) -> bool:
+        return found._replace(**added_costs(found._asdict(), spent)).within(config)
+
+    best, earlier = None, _worst_so_far(spent)
     for threshold in thresholds_below(below):
-        beyond = worst_loss(cameras, threshold) > config.camera_surface_mass
+        beyond = worst_loss(cameras, threshold) + earlier > config.camera_surface_mass
         if best is not None and beyond:
             continue
         if not missed_only:
             cheap = measure(rendering, threshold, with_image=False)
-            if not cheap._replace(image_price_db=0.0, price_error_db=0.0).within(config):
+            if not within(cheap._replace(image_price_db=0.0, price_error_db=0.0)):
                 continue
         measured = measure(rendering, threshold, missed_only=missed_only)
-        if not measured.within(config):
+        if not within(measured):
             continue
         if not beyond:
             kept = 1.0 - measured.empty_fraction

@@ -20,8 +20,10 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from leco_plugin.learning.calibration import (
+    LOSSES,
     CalibrationConfig,
     Measured,
+    added_costs,
     calibrate,
     measure,
     promise,
@@ -122,12 +124,6 @@ def round_weights(gate: torch.nn.Module) -> None:
         parameter.copy_(parameter.bfloat16().float())
 
 
-LOSSES = ("lost_surface_mass", "lost_mass", "image_price_db")
-"""What a report says that skipping costs."""
-ERRORS = ("surface_error", "price_error_db")
-"""Standard errors of those."""
-
-
 @dataclass(frozen=True)
 class SharpeningConfig:
     """When and how a small gate is taught by the field."""
@@ -154,13 +150,6 @@ class SharpeningConfig:
             raise InputError(f"sharpening.gate: {error}; no size of it is automatic") from None
 
 
-def added_costs(found: dict[str, Any], before: dict[str, Any]) -> dict[str, float]:
-    """What skipping costs on top of what earlier skipping has cost, and standard errors."""
-    known = {name: float(before.get(name, 0.0)) for name in (*LOSSES, *ERRORS)}
-    costs = {name: max(0.0, found[name]) + max(0.0, known[name]) for name in LOSSES}
-    return costs | {name: math.hypot(found[name], known[name]) for name in ERRORS}
-
-
 class Sharpened(NamedTuple):
     """A small gate, and what it does on held-out rays."""
 
@@ -169,7 +158,8 @@ class Sharpened(NamedTuple):
     before: Measured
     """The same of what has guided so far."""
     promised: dict[str, Any] | None
-    """What photographs that vouch say of it, see `calibration.promise`."""
+    """What photographs that vouch say of it and of what has guided so far, see
+    `calibration.promise`."""
 
     @property
     def pays(self) -> bool:
@@ -198,9 +188,7 @@ class Sharpened(NamedTuple):
         measured = self.measured._asdict()
         found = measured | added_costs(measured, before)
         if self.promised is not None:
-            earlier = (before.get(CAMERAS_THAT_VOUCH) or {}).get("worst_surface_mass", 0.0)
-            more = {name: self.promised[name] + earlier for name in ("worst_surface_mass", "bound")}
-            found[CAMERAS_THAT_VOUCH] = self.promised | more
+            found[CAMERAS_THAT_VOUCH] = self.promised
         kept = {name: before[name] for name in ("threshold", "params", "empty_fraction", *LOSSES)}
         known = {"learned": {"gate": learned.to_dict(), **kept}}
         return known | before | found | {"params": self.params}
@@ -219,7 +207,7 @@ def sharpen(
     changes nothing. None where no ray has a candidate to teach with.
 
     The field knows only what has been kept, so the rest counts as empty, and prices are of skipping
-    more than before.
+    more than before. Together with what that has cost they are held to the bounds.
 
     Args:
         taught: training rays, cut to the region.
@@ -241,8 +229,10 @@ def sharpen(
         of_each = [of_one for of_one, _ in cameras]
         seen = [seen_reference(mixture, of_one) for of_one in of_each]
         of_cameras = list(map(partial(_said_by, mixture, score), of_each, seen))
-        measured = calibrate(asked, calibration, cameras=of_cameras)
-        return Sharpened(gate, measured, before, promise(of_cameras, measured, calibration))
+        spent = mixture.report
+        measured = calibrate(asked, calibration, cameras=of_cameras, spent=spent)
+        promised = promise(of_cameras, measured, calibration, spent)
+        return Sharpened(gate, measured, before, promised)
 
 
 @torch.no_grad()

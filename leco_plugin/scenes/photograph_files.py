@@ -46,7 +46,7 @@ class Header(NamedTuple):
     """What a file of an image says before it is decoded."""
 
     size: tuple[int, int]
-    """Width and height of what is stored; of a TIFF, which Pillow sets upright, of what it decodes."""
+    """Width and height of what is stored; of a TIFF of what Pillow decodes, which is upright."""
     mode: str
     """Pillow's."""
     transparent: bool

@@ -14,6 +14,7 @@ from torch import Tensor
 from leco_plugin.learning.calibration import (
     THRESHOLDS,
     CalibrationConfig,
+    Measured,
     backdrop_price,
     calibrate,
     measure,
@@ -32,6 +33,7 @@ from leco_plugin.learning.dense import (
     weighed,
 )
 from leco_plugin.models.rendering import Intervals, Rays, Shaded
+from leco_plugin.occupancy import CAMERAS_THAT_VOUCH
 from leco_plugin.samplers.packed import accumulate_along_rays, pack_info
 
 RAYS, SAMPLES = 20, 30
@@ -110,6 +112,47 @@ def test_the_threshold_is_the_largest_within_the_bounds(
     fitting = [t for t in THRESHOLDS if measure(problem.rendering(), t).within(config)]
     assert found.threshold == max(fitting, default=0.0)
     assert found.threshold == 0.0 or found.within(config)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.9, 1.5])
+@pytest.mark.parametrize("seed", range(4))
+def test_what_was_spent_and_what_is_spent_now_are_held_to_one_bound(
+    seed: int, share: float
+) -> None:
+    """A small gate skips on top of a learned one, so that each may not spend all of it."""
+    rendering, config = Problem(seed).rendering(), CalibrationConfig(0.05, 0.5)
+    spent = Measured(0.5, share * 0.05, 0.01, share * 0.5, 0.5, 0.004, 0.03)._asdict()
+
+    def costs(threshold: float) -> Measured:
+        found = measure(rendering, threshold)
+        return found._replace(
+            lost_surface_mass=found.lost_surface_mass + share * 0.05,
+            image_price_db=max(0.0, found.image_price_db) + share * 0.5,
+            surface_error=math.hypot(found.surface_error, 0.004),
+            price_error_db=math.hypot(found.price_error_db, 0.03),
+        )
+
+    fitting = [t for t in THRESHOLDS if costs(t).within(config)]
+    found = calibrate(rendering, config, spent=spent)
+    assert found == measure(rendering, max(fitting, default=0.0))
+    assert (found.threshold == 0.0) == (share > 1.0)
+    assert found.threshold <= calibrate(rendering, config).threshold
+
+
+def test_what_a_photograph_has_lost_so_far_counts_against_its_bound() -> None:
+    problem, config = Problem(0), CalibrationConfig(0.05, 1.0)
+    cameras = [Chunk(seed).reference for seed in (12, 13, 17, 25, 36, 39, 42, 43, 44)]
+    alone = calibrate(problem.rendering(), config)
+    lower = THRESHOLDS[THRESHOLDS.index(alone.threshold) + 1]
+    allowed = worst_loss(cameras, alone.threshold)
+    config = replace(config, camera_surface_mass=allowed)
+    assert calibrate(problem.rendering(), config, cameras=cameras) == alone
+    earlier = allowed - worst_loss(cameras, lower)
+    spent = {CAMERAS_THAT_VOUCH: {"worst_surface_mass": earlier}}
+    assert calibrate(problem.rendering(), config, cameras=cameras, spent=spent).threshold == lower
+    promised = promise(cameras, alone, config, spent)
+    assert promised["worst_surface_mass"] == promised["bound"] == allowed + earlier
+    assert promise(cameras, measure(problem.rendering(), 0.0), config, spent)["bound"] == allowed
 
 
 def test_no_photograph_that_vouches_loses_more_than_its_bound() -> None:
