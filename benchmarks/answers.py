@@ -23,6 +23,7 @@ from leco_plugin.chart.methods import SUITES
 from leco_plugin.chart.panels import asks_what_was_learned, finding_of
 from leco_plugin.chart.representations import COSTS, fronts_of, representations_of
 from leco_plugin.chart.summary import RENDERING, Line, compare, lines_of, sentence
+from leco_plugin.log import counted
 
 HEAD = """## The answers with their figures
 
@@ -104,7 +105,7 @@ def in_short(charts: Sequence[Mapping[str, Any]]) -> str:
 
 def scenes_of(charts: Sequence[Any]) -> str:
     """How many scenes there are charts of, in words."""
-    return f"{len(charts)} scene{'s' if len(charts) > 1 else ''}"
+    return counted(len(charts), "scene")
 
 
 def _none_is_better(learned: Sequence[Learned]) -> bool:

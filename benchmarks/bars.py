@@ -17,6 +17,7 @@ from leco_plugin.chart.learned import learned_of
 from leco_plugin.chart.methods import NEVER_FROZEN, VARIANTS
 from leco_plugin.chart.summary import Line, Verdict, figure_in, lines_of, versus
 from leco_plugin.chart.table import rows
+from leco_plugin.log import counted
 
 EQUAL_EXPERTS = VARIANTS["leco-occupancy-homogeneous"]
 CITY, SURVEY, SURVEY_NAME = "charts/city-3", "charts/caliterra", "`caliterra`"
@@ -204,9 +205,8 @@ def of_kills(folder: Path) -> list[str]:
     results = json.loads(path.read_text())
     lost = [has_lost(kill) for run in results["killed"] for kill in run["kills"]]
     gone_on, killed = runs_gone_on(results)
-    said = (
-        f"{sum(lost)} of {len(lost)} kills lost something; {gone_on} of {killed} runs ended frozen"
-    )
+    kills, runs = counted(len(lost), "kill"), counted(killed, "run")
+    said = f"{sum(lost)} of {kills} lost something; {gone_on} of {runs} ended frozen"
     old = noted(folder).get("kills")
     said += f". {old.rstrip('.')}" if old else ""
     reached = "yes" if not any(lost) and gone_on == killed else "**no**"

@@ -198,6 +198,16 @@ def spell(seconds: float) -> str:
     return f"{hours} h {rest} min" if hours else f"{minutes} min"
 
 
+def by_number(count: int, one: str, many: str) -> str:
+    """Words for one thing, or words for another number of them."""
+    return one if count == 1 else many
+
+
+def counted(count: int, one: str, many: str | None = None) -> str:
+    """A number of things in words: 1 run, 2 runs. Without `many` that is `one` with an s."""
+    return f"{count} {by_number(count, one, many or f'{one}s')}"
+
+
 @contextmanager
 def resumable() -> Iterator[None]:
     """A context for resumable work: Ctrl-C says that finished parts are kept."""

@@ -143,9 +143,9 @@ def test_the_demo_of_an_earlier_release_has_no_minutes(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("after", "frozen", "measured", "reached"),
     [
-        (5, True, "0 of 1 kills lost something; 1 of 1 runs ended frozen", "yes"),
-        (3, True, "1 of 1 kills lost something; 1 of 1 runs ended frozen", "**no**"),
-        (5, False, "0 of 1 kills lost something; 0 of 1 runs ended frozen", "**no**"),
+        (5, True, "0 of 1 kill lost something; 1 of 1 run ended frozen", "yes"),
+        (3, True, "1 of 1 kill lost something; 1 of 1 run ended frozen", "**no**"),
+        (5, False, "0 of 1 kill lost something; 0 of 1 run ended frozen", "**no**"),
     ],
 )
 def test_kills_reach_their_bar_where_nothing_is_lost_and_all_end_alike(

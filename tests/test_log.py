@@ -114,3 +114,9 @@ def test_what_is_kept_back_is_not_on_the_screen(
     assert kept == ["said", "noted", "warned of"] and not capsys.readouterr().out
     log.say("said again")
     assert "said again" in capsys.readouterr().out and len(kept) == 3
+
+
+def test_one_thing_is_counted_without_an_s() -> None:
+    assert [log.counted(count, "run") for count in (0, 1, 2)] == ["0 runs", "1 run", "2 runs"]
+    assert log.counted(1, "mask has", "masks have") == "1 mask has"
+    assert log.counted(3, "mask has", "masks have") == "3 masks have"

@@ -21,6 +21,7 @@ from leco_plugin.chart.theme import (
     themed,
 )
 from leco_plugin.evaluation.report import describe_cores
+from leco_plugin.log import counted
 
 Row = Mapping[str, Any]
 """What was measured of a representation."""
@@ -210,7 +211,8 @@ def circumstances(results: Mapping[str, Any]) -> str:
     where = describe_cores(machine) if machine["device"] == "cpu" else machine["device"]
     return (
         f"{scene['name']}, {scene['train_images']} photographs; one field of "
-        f"{results['learn_steps']} steps teaches all; {results['rays']} held-out rays; {where}. "
+        f"{counted(results['learn_steps'], 'step')} teaches all; {results['rays']} held-out rays; "
+        f"{where}. "
         f"Gates in bfloat16, grids as octrees{left_out}; down and left is better. "
         "Chosen: what has ten times the bytes does not keep a third less."
     )

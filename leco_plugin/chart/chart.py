@@ -38,6 +38,7 @@ from leco_plugin.chart.runner import (
 from leco_plugin.chart.table import table
 from leco_plugin.chart.theme import DARK, LIGHT
 from leco_plugin.evaluation.report import describe_code, describe_machine, read_object
+from leco_plugin.log import counted
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import describe_held_out, describe_scene, megapixels_of
 from leco_plugin.scenes.whole_files import write_json
@@ -117,7 +118,7 @@ class Chart:
         with self.folder.alone():
             taken = take_over(self.folder, self.missing(), self.reuse)
             if taken:
-                say(f"{_counted(len(taken))} taken over from other charts")
+                say(f"{counted(len(taken), 'run')} taken over from other charts")
             if todo := self.missing():
                 say(self.forecast(todo))
             self.write()
@@ -148,10 +149,11 @@ class Chart:
         """How many runs are to be made, and about how long that takes."""
         megapixels = megapixels_of(self.data) or SMALL
         about = forecast((job.contender for job in todo), self.protocol, megapixels)
-        runs = f"{_counted(len(todo))} of {self.protocol.describe()}"
+        runs = f"{counted(len(todo), 'run')} of {self.protocol.describe()}"
         beside = f", {self.protocol.at_once} at a time" if self.protocol.at_once > 1 else ""
         stored = len(self.jobs) - len(todo)
-        there = f" ({stored} more are there already)" if stored else ""
+        more = counted(stored, "more is there already", "more are there already")
+        there = f" ({more})" if stored else ""
         return f"{runs}{beside}, {about}{there}"
 
     def failures(self) -> list[dict[str, Any]]:
@@ -234,10 +236,6 @@ class Chart:
             picture.draw(results, place / "chart-dark.png", DARK)
             page.write_page(results, place / "chart.html")
         return results
-
-
-def _counted(runs: int) -> str:
-    return f"{runs} run{'s' if runs != 1 else ''}"
 
 
 def why_not_shared(source: Path, settings: Mapping[str, Any]) -> str | None:

@@ -13,7 +13,7 @@ from leco_plugin.chart.contender import Protocol
 from leco_plugin.chart.methods import SUITES, contenders, in_order
 from leco_plugin.chart.runner import ProcessRunner, Runner
 from leco_plugin.chart.worker import WORKER
-from leco_plugin.log import bar, put, resumable
+from leco_plugin.log import bar, counted, put, resumable
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import HeldOut
 
@@ -88,7 +88,7 @@ def refuse_failures(made: Sequence[Mapping[str, Any]]) -> None:
         count = len(failures) + sum(len(results["runs"]) for results in made)
         first = f"({failures[0]['name']}, seed {failures[0]['seed']})"
         raise RuntimeError(
-            f"{len(failures)} of {count} runs failed, the first {first} with: "
+            f"{len(failures)} of {counted(count, 'run')} failed, the first {first} with: "
             f"{failures[0]['reason']}"
         )
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from leco_plugin.evaluation.clock import Budget
 from leco_plugin.hosts.guided_start import OWN_SAMPLER
+from leco_plugin.log import counted
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import HeldOut
 
@@ -235,7 +236,7 @@ class Protocol:
     def describe(self) -> str:
         """Time and steps in a few words."""
         seconds = [] if self.seconds is None else [f"{self.seconds:g} s"]
-        steps = [] if self.steps is None else [f"{self.steps} steps"]
+        steps = [] if self.steps is None else [counted(self.steps, "step")]
         return " or ".join(seconds + steps)
 
 
@@ -317,5 +318,5 @@ def forecast(contenders: Iterable[Contender], protocol: Protocol, megapixels: fl
         for cores in (FAST, SLOW)
     )
     if fast == slow:
-        return f"about {fast} minute{'s' if fast > 1 else ''} on two CPU cores"
+        return f"about {counted(fast, 'minute')} on two CPU cores"
     return f"about {fast} to {slow} minutes on two CPU cores, by their speed"

@@ -14,6 +14,7 @@ from scipy.special import stdtrit
 
 from leco_plugin.chart.contender import Protocol, shared_method, short_names
 from leco_plugin.evaluation.report import describe_cores
+from leco_plugin.log import counted
 
 CONFIDENCE = 0.95
 """Of the interval around a difference of means; of each comparison alone, however many are made."""
@@ -322,7 +323,7 @@ def describe_seeds(results: Mapping[str, Any]) -> str:
     said = "one seed" if most == 1 else f"{most} seeds" if least == most else ""
     said = said or f"{least} to {most} seeds"
     failed = len(results.get("failures", ()))
-    return f"{said}; {failed} run{'s' * (failed > 1)} failed" if failed else said
+    return f"{said}; {counted(failed, 'run')} failed" if failed else said
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,7 @@ from leco_plugin.conformance.scene import (
     same,
     without_samples,
 )
+from leco_plugin.log import counted
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.marching import Samples
 from leco_plugin.samplers.registry import build_proposal
@@ -208,7 +209,10 @@ def sorted_disjoint_inside(case: ProposalCase) -> None:
     for samples in (packed(ray_samples), *map(packed, candidates)):
         check_intervals(rays, samples)
         beyond = samples[2] > rays.t_max[samples[0]] + ROUNDING
-        require(not bool(beyond.any()), f"{int(beyond.sum())} samples end beyond a ray's far end")
+        require(
+            not bool(beyond.any()),
+            f"{counted(int(beyond.sum()), 'sample ends', 'samples end')} beyond a ray's far end",
+        )
     check_order(packed(case.answer(case.shared(SLAB).train(), rays)[0]))
 
 
@@ -242,7 +246,9 @@ def _check_gathered(
     middles = middles.view(len(rays.origins), -1)[long]
     inside = depths > 0.0
     without = int((~inside.any(dim=1)).sum())
-    require(without == 0, f"{without} rays have no sample in what is occupied")
+    require(
+        without == 0, f"{counted(without, 'ray has', 'rays have')} no sample in what is occupied"
+    )
     if not case.needs_occupancy:
         return
     least = float((depths > -NEARBY).float().mean(dim=1).min())
@@ -250,7 +256,8 @@ def _check_gathered(
     halfway = ((enters + leaves) / 2.0)[long, None]
     for half, there in (("near", middles < halfway), ("far", middles > halfway)):
         bare = int((~(inside & there).any(dim=1)).sum())
-        require(bare == 0, f"{bare} rays have no sample in the {half} half of what is kept")
+        some = counted(bare, "ray has", "rays have")
+        require(bare == 0, f"{some} no sample in the {half} half of what is kept")
 
 
 def chords(rays: Rays, scene: Slab = SLAB) -> tuple[Tensor, Tensor]:

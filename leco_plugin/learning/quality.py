@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from leco_plugin.evaluation.metrics import psnr
+from leco_plugin.log import by_number, counted
 from leco_plugin.occupancy import CAMERAS_THAT_VOUCH
 
 if TYPE_CHECKING:
@@ -51,9 +52,11 @@ def views_in_words(report: dict[str, Any]) -> str:
     said = report.get(CAMERAS_THAT_VOUCH)
     if not isinstance(said, dict):
         return "calibrated on pixels of training photographs alone: new views may lose more"
+    lose = by_number(said["count"], "loses", "lose")
+    of_their = by_number(said["count"], "its", "their")
     return (
-        f"{said['count']} photographs that taught it nothing lose at most "
-        f"{said['worst_surface_mass']:.2%} of their surfaces: a new view loses at most "
+        f"{counted(said['count'], 'photograph')} that taught it nothing {lose} at most "
+        f"{said['worst_surface_mass']:.2%} of {of_their} surfaces: a new view loses at most "
         f"{said['bound']:.2%}, with {said['confidence']:.0%} confidence"
     )
 

@@ -18,7 +18,7 @@ from nerfstudio.data.utils import dataloaders
 from nerfstudio.model_components.ray_generators import RayGenerator
 from torch import Tensor
 
-from leco_plugin.log import say
+from leco_plugin.log import by_number, counted, say
 from leco_plugin.models.compute.device import free_memory
 from leco_plugin.scenes.frames import UP_IS_KNOWN, turn_outputs, turn_to_upright
 from leco_plugin.scenes.input_error import InputError
@@ -142,7 +142,9 @@ class LecoDataManager(Vanilla):  # type: ignore[type-arg]
             super().setup_train()
             return
         gigabytes = decoded_bytes(self.train_dataset) / 1e9
-        say(f"{len(self.train_dataset)} photographs, {gigabytes:.1f} GB decoded, stay on disk")
+        count = len(self.train_dataset)
+        stay = by_number(count, "stays", "stay")
+        say(f"{counted(count, 'photograph')}, {gigabytes:.1f} GB decoded, {stay} on disk")
         self.iter_train_image_dataloader = self._store(self.train_dataset, "photographs")
         rays = self.config.train_num_rays_per_batch
         self.train_pixel_sampler = self._get_pixel_sampler(self.train_dataset, rays)
@@ -209,7 +211,7 @@ def read_in_words(data: Path, training: Any, tests: int) -> str:
     points = points_in(training.metadata)
     found = "no sparse points" if points is None else f"{len(points):,} sparse points"
     name = (data if data.is_dir() else data.parent).resolve().name
-    counts = f"{len(training)} photographs to learn from, {tests} to test with"
+    counts = f"{counted(len(training), 'photograph')} to learn from, {tests} to test with"
     return f"{name}: {counts}, {size}; {found}"
 
 

@@ -11,7 +11,7 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-from leco_plugin.log import say
+from leco_plugin.log import counted, say
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.region import SIDE, Region
 from leco_plugin.models.rendering import Rays
@@ -154,7 +154,8 @@ class LearningData:
         """A line on each thing that often makes a scene fail, before anything is learned."""
         dataset, found = self.manager.train_dataset, []
         if len(dataset) < FEW_PHOTOGRAPHS:
-            few = f"{len(dataset)} training photographs are few: new views may fail"
+            few = counted(len(dataset), "training photograph is", "training photographs are")
+            few += " few: new views may fail"
             found.append(f"{few}; more, which overlap by two thirds, usually help")
         if sparse_points(dataset) is None:
             why = "this scene has no sparse points, so that its bounds are guessed from its cameras"

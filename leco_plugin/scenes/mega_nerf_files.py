@@ -23,6 +23,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from leco_plugin.log import counted
 from leco_plugin.scenes.city.shapes import Array
 from leco_plugin.scenes.frames import SKEW, distance_from_rotations
 from leco_plugin.scenes.input_error import InputError
@@ -209,7 +210,8 @@ def _pairs(folder: Path, split: str) -> list[tuple[Path, Path]]:
     if lonely:
         what = "metadata" if lonely[0] in images else f"picture ({' '.join(ENDINGS)})"
         raise InputError(
-            f"{folder / split} holds {len(images)} pictures and {len(files)} metadata files; "
+            f"{folder / split} holds {counted(len(images), 'picture')} and "
+            f"{counted(len(files), 'metadata file')}; "
             f"{lonely[0]} has no {what}"
         )
     return [(files[stem], images[stem]) for stem in files]

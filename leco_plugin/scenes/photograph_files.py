@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
-from leco_plugin.log import say
+from leco_plugin.log import by_number, counted, say
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.whole_files import write_whole
 
@@ -115,9 +115,9 @@ def find_file(path: Path) -> Path:
 def check_images(paths: list[Path]) -> None:
     """InputError if an image is not there."""
     if missing := [path for path in paths if not path.exists()]:
-        count, first = f"{len(missing)} of {len(paths)}", missing[0]
-        why = remedy_for_missing(first)
-        raise InputError(f"{count} images are not there, the first is {first}{why}")
+        some = f"{len(missing)} of {counted(len(paths), 'image')}"
+        some += by_number(len(missing), " is", " are") + " not there, the first is"
+        raise InputError(f"{some} {missing[0]}{remedy_for_missing(missing[0])}")
 
 
 def remedy_for_missing(path: Path) -> str:
@@ -267,13 +267,14 @@ def convert_masks(
         found.append(path if as_it_is else derived.get(path, f"mask {size}", made))
         shown.append(bool(fitting.any()))
     if not any(shown):
-        none = f"the masks leave no pixel of {len(masks)} images, the first is {masks[0]}"
+        images_of = counted(len(masks), "image")
+        none = f"the masks leave no pixel of {images_of}, the first is {masks[0]}"
         raise InputError(f"{none}: a mask is black where its image is not to be used")
     if not all(shown) and len(set(sizes)) > 1:
         none = f"the mask {found[shown.index(False)]} leaves no pixel, and each image of a scene"
         raise InputError(f"{none} of many sizes must give some: leave its image out")
     if grey and speak:
-        some = f"{len(grey)} masks have greys between black and white"
+        some = counted(len(grey), "mask has", "masks have") + " greys between black and white"
         say(f"{some}, of which those from {HALF} on are seen; the first is {grey[0]}")
     return found
 

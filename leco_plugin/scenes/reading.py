@@ -20,7 +20,7 @@ from nerfstudio.data.dataparsers import base_dataparser
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
 from PIL import UnidentifiedImageError
 
-from leco_plugin.log import bar, say
+from leco_plugin.log import bar, by_number, counted, say
 from leco_plugin.scenes import photograph_files, scene_file
 from leco_plugin.scenes.frames import check_poses
 from leco_plugin.scenes.input_error import InputError, one_line
@@ -169,7 +169,7 @@ def checked(
     cameras, factor = outputs.cameras, 1
     if cameras.camera_to_worlds.shape != (len(images), 3, 4):
         # as nerfstudio's reader of instant-ngp makes them of one photograph
-        some = f"no cameras of {len(images)} photographs of the split {split}"
+        some = f"no cameras of {counted(len(images), 'photograph')} of the split {split}"
         remedy = "hold out more by a lower --train-split-fraction"
         raise InputError(f"{data}: {reader_name(config)} makes {some}: {remedy}")
     names = [f"{data}: the pose of {path}" for path in images]
@@ -252,14 +252,22 @@ def _plain_pictures(
             progress(len(paths) / len(images))
     transparent = [path for path, header in zip(images, headers) if header.transparent]
     if 0 < len(transparent) < len(images):
-        some = f"{len(transparent)} of {len(images)} images have transparency"
+        have = by_number(len(transparent), "has", "have")
+        some = f"{len(transparent)} of {len(images)} images {have} transparency"
         raise InputError(f"{some}, the first is {transparent[0]}: {SAVE_ALIKE}")
-    into = f"are converted into {derived.folder}"
-    lines = [f"{count} photographs {what} {into}" for what, count in converted.items()]
+    lines = [
+        f"{counted(count, 'photograph')} {what} {by_number(count, 'is', 'are')} converted into "
+        f"{derived.folder}"
+        for what, count in converted.items()
+    ]
     if as_stored:
         lines.append(
-            f"{len(as_stored)} photographs are used as they are stored, though EXIF turns them: "
-            f"that is what their intrinsics are for; the first is {as_stored[0]}. "
+            counted(
+                len(as_stored),
+                "photograph is used as it is stored, though EXIF turns it",
+                "photographs are used as they are stored, though EXIF turns them",
+            )
+            + f": that is what the intrinsics are for; the first is {as_stored[0]}. "
             "Where renders are turned, `mogrify -auto-orient` them and make the scene anew"
         )
     return paths, lines

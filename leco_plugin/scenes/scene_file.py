@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from nerfstudio.cameras.cameras import Cameras
 
-from leco_plugin.log import say
+from leco_plugin.log import by_number, say
 from leco_plugin.scenes.frames import check_poses
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.lenses import (
@@ -120,7 +120,7 @@ def read_scene_file(path: Path, split: str, folder: Path) -> SceneFile:
     check_together(lenses, str(path))
     masked = sum("mask_path" in frame for frame in frames)
     if 0 < masked < len(frames):
-        some = f"{masked} of {len(frames)} images have a mask_path"
+        some = f"{masked} of {len(frames)} images {by_number(masked, 'has', 'have')} a mask_path"
         raise InputError(f"{path.parent}: {some}; give one to all or to none")
     return SceneFile(path, meta, frames, lenses, folder)
 

@@ -25,7 +25,7 @@ from leco_plugin.chart.runner import (
 )
 from leco_plugin.chart.theme import DARK, LIGHT
 from leco_plugin.evaluation.report import describe_code, describe_machine, usable_cores
-from leco_plugin.log import bar, put, resumable, spell
+from leco_plugin.log import bar, by_number, counted, put, resumable, spell
 from leco_plugin.occupancy import CALIBRATED_AT
 from leco_plugin.scenes.city.folder import TRANSFORMS
 from leco_plugin.scenes.input_error import InputError
@@ -96,10 +96,11 @@ def make_table(
         sizes = QUICK if quick else FULL
         suite = Suite(out, chosen, compared, seeds, sizes, command, seeds_beside)
         put(suite.estimate())
-        with resumable(), bar(f"{len(chosen)} cases") as show:
+        with resumable(), bar(counted(len(chosen), "case")) as show:
             suite.make(put, show, math.inf if minutes is None else 60.0 * minutes)
         if left := len(suite.missing()):
-            put(f"{left} runs are left or have failed; the same command goes on with them")
+            some = counted(left, "run is left or has failed", "runs are left or have failed")
+            put(f"{some}; the same command goes on with {by_number(left, 'it', 'them')}")
         return suite.draw()
 
 
@@ -181,10 +182,9 @@ class Suite:
         """How long what is missing takes, in words."""
         todo, stored = self.missing(), list(self.stored().values())
         seconds = core_seconds(todo, stored) / self.workers
-        return (
-            f"{len(todo)} of {len(runs_of(self.entries))} runs are to be made, {self.workers} at a "
-            f"time: about {spell(seconds)}"
-        )
+        runs = counted(len(runs_of(self.entries)), "run")
+        some = f"{len(todo)} of {runs} {by_number(len(todo), 'is', 'are')} to be made"
+        return f"{some}, {self.workers} at a time: about {spell(seconds)}"
 
     def make(self, say: Say, show: Callable[[float], None], seconds: float = math.inf) -> None:
         """Makes what is missing; whenever this is stopped, what was finished is kept.

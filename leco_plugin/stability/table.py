@@ -16,6 +16,7 @@ from PIL import Image
 
 from leco_plugin.chart.table import rows
 from leco_plugin.chart.theme import LIGHT, Theme, new_figure, save_picture
+from leco_plugin.log import counted
 from leco_plugin.stability.plan import LEARNED, QUICK
 
 NOTHING = "nothing has been run yet"
@@ -108,13 +109,13 @@ def _count_passes(results: Results) -> str:
             parts.append(f"{one['title']}{word} {held.count('pass')} of {len(held)}")
     if not parts:
         return NO_VERDICT if any(cell["seeds"] for cell in cells) else NOTHING
-    parts[0] += " cases"
+    parts[0] += " cases" if not parts[0].endswith(" of 1") else " case"
     ours = [row["cells"].get(LEARNED, {}) for row in results["cases"] if not row["must_fail"]]
     apart = sum(cell.get("verdict") == "no reference" and cell["seeds"] > 0 for cell in ours)
     if apart:
         parts.insert(1, f"for {apart} more it has no dense run that trains")
     if missing := sum(cell["missing"] for cell in cells):
-        parts.append(f"{missing} seeds of cells are missing")
+        parts.append(counted(missing, "seed of a cell is missing", "seeds of cells are missing"))
     if is_unproven(results):
         parts.append("unproven: the case that must fail has not failed")
     return "; ".join(parts)
@@ -168,7 +169,7 @@ def figures(cell: Mapping[str, Any]) -> tuple[str, str, str]:
         parts.append(f"healed {healed} x")
     seeds = [f"worst {cell['worst']:+.2f}"] if cell["seeds"] > 1 else []
     if cell["missing"]:
-        seeds.append(f"{cell['seeds']} of {cell['seeds'] + cell['missing']} seeds")
+        seeds.append(f"{cell['seeds']} of {counted(cell['seeds'] + cell['missing'], 'seed')}")
     return first, ", ".join(parts), ", ".join(seeds)
 
 

@@ -12,6 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
+from leco_plugin.log import counted
+
 Verdict = Literal["pass", "degraded", "fail", "no reference"]
 Runs = Sequence[Mapping[str, Any]]
 
@@ -81,7 +83,8 @@ def judge(
     """
     if failures:
         many = len(failures) + len(runs)
-        return Cell("fail", f"{len(failures)} of {many} runs ended: {failures[0]}", many, missing)
+        ended = f"{len(failures)} of {counted(many, 'run')} ended: {failures[0]}"
+        return Cell("fail", ended, many, missing)
     if not runs:
         return Cell("no reference", "not run", 0, missing)
     if reference is not None:

@@ -25,6 +25,7 @@ from torch.nn import Parameter
 from torch.optim import Optimizer
 
 from leco_plugin.learning.run import LearningOnly, Run
+from leco_plugin.log import counted
 from leco_plugin.models.compute.ranks import is_first
 from leco_plugin.models.sizing.sizes import sizes_in, sizes_to_resume
 from leco_plugin.scenes.input_error import InputError, one_line
@@ -136,8 +137,8 @@ def check_photographs(pipeline: Any) -> None:
     now = len(pipeline.datamanager.train_dataset)
     if model.num_train_data != now:
         raise InputError(
-            f"the run was begun with {model.num_train_data} training photographs, and the scene "
-            f"has {now}: put the same ones there, or begin a new run"
+            f"the run was begun with {counted(model.num_train_data, 'training photograph')}, and "
+            f"the scene has {now}: put the same ones there, or begin a new run"
         )
 
 

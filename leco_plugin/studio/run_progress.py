@@ -29,7 +29,7 @@ from leco_plugin.evaluation.inspection import describe, doubts
 from leco_plugin.evaluation.metrics import FigureUnavailable
 from leco_plugin.learning.freezing import FILE_NAME, leave_file
 from leco_plugin.learning.quality import AT_END, FIELD, ONE_COLOUR
-from leco_plugin.log import Show, bar, details_in, on_screen, say, say_all, spell
+from leco_plugin.log import Show, bar, counted, details_in, on_screen, say, say_all, spell
 from leco_plugin.models.compute.ranks import is_first
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.studio.commands import hide_warnings_of_no_use
@@ -165,7 +165,7 @@ class RunProgress:
         self._bar.close()
         seconds, pixels = time.monotonic() - self.began, self.psnr.look_last()
         reached = self._words().replace(OF, f"on {pixels:,} held-out pixels")
-        line = f"finished: {self.steps} steps in {spell(seconds)}"
+        line = f"finished: {counted(self.steps, 'step')} in {spell(seconds)}"
         tested = self.psnr.look_at_tests()
         of_tests = "" if tested is None else f"{tested:.1f} dB on test photographs"
         say(", ".join(filter(None, [line, reached, of_tests])))

@@ -20,7 +20,7 @@ from nerfstudio.utils.decorators import check_main_thread
 
 from leco_plugin.learning.collapse import GateCollapsed
 from leco_plugin.learning.run import Progress
-from leco_plugin.log import say, say_what_is_logged
+from leco_plugin.log import counted, say, say_what_is_logged
 from leco_plugin.models.compute.ranks import is_first
 from leco_plugin.samplers.kernels import VARIABLE, kernels_off
 from leco_plugin.scenes.input_error import InputError, TrainingStopped
@@ -129,8 +129,9 @@ class AtomicTrainer(Trainer):
             self.config = config
         if self._start_step >= end_of(self):
             raise InputError(
-                f"the checkpoint has {self._start_step} steps already: this nerfstudio counts them "
-                f"in --max-num-iterations {self.config.max_num_iterations}, so give more"
+                f"the checkpoint has {counted(self._start_step, 'step')} already: this nerfstudio "
+                f"counts these in --max-num-iterations {self.config.max_num_iterations}, so give "
+                "more"
             )
         self.config = keep_sizes(self.config, self.pipeline.model, asked)
         self.saved_at = time.monotonic()

@@ -83,7 +83,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "metadata without a picture": (
         lambda s: (s / "val/rgbs/000002.png").unlink(),
-        "val holds 1 pictures and 2 metadata files; 000002 has no picture",
+        "val holds 1 picture and 2 metadata files; 000002 has no picture",
     ),
     "a picture of an unknown ending": (
         lambda s: (s / "val/rgbs/000002.png").rename(s / "val/rgbs/000002.tif"),

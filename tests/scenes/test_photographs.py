@@ -94,7 +94,7 @@ BAD_MEASURES: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "a missing image": (
         lambda s: (s / "images" / "003.png").unlink(),
-        "1 of 9 images are not there, the first is .*003.png",
+        "1 of 9 images is not there, the first is .*003.png",
     ),
     "an image that is none": (
         lambda s: (s / "images" / "003.png").write_bytes(b"nothing"),

@@ -48,12 +48,14 @@ def test_a_portion_is_made_and_the_same_command_goes_on(
 ) -> None:
     monkeypatch.setattr(suite, "usable_cores", lambda: 1)
     words = ("--cases", "yard", "--samplers", "grid-128", "learned", "--minutes", "0.001")
-    for left in (2, 1):
+    for left in (
+        "2 runs are left or have failed; the same command goes on with them",
+        "1 run is left or has failed; the same command goes on with it",
+    ):
         assert stability(tmp_path / "out", *words) == 0
-        said = " ".join(capsys.readouterr().out.split())
-        assert f"{left} runs are left or have failed; the same command goes on with them" in said
+        assert left in " ".join(capsys.readouterr().out.split())
     assert stability(tmp_path / "out", *words) == 0
-    assert "runs are left" not in capsys.readouterr().out
+    assert "left or ha" not in capsys.readouterr().out
     assert sorted(name for _, name, _ in runs.made) == ["dense", "grid-128", "learned"]
     assert stability(tmp_path / "out", "--minutes", "0") == 2
 

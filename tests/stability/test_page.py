@@ -47,7 +47,7 @@ def test_the_page_shows_the_stored_table_and_says_where_its_runs_come_from(
     )
     (results / "stability.json").write_text(json.dumps(table))
     shown = stability_page.page(empty, results)
-    assert "Grid 128³ passes 0 of 1 cases." in shown
+    assert "Grid 128³ passes 0 of 1 case." in shown
     assert "| a yard | **fail**: -2.00 dB (kept 25%, lost 0.1%, worst +0.00) |" in shown
     assert "| a yard | grid 128³ | 2.00 dB below dense |" in shown
     assert "4 runs, 0.0 hours of one core" in shown and table["machine"]["cpu"] in shown

@@ -69,7 +69,7 @@ def test_a_case_in_which_nobody_is_held_to_anything_is_counted_apart() -> None:
     both_ways = [("pass", 3), ("no reference", 3), ("no reference", 0)]
     rows = [(word, False, {"learned": cell(word, seeds=n)}) for word, n in both_ways]
     assert headline(results(*rows)) == (
-        "learned occupancy passes 1 of 1 cases; for 1 more it has no dense run that trains"
+        "learned occupancy passes 1 of 1 case; for 1 more it has no dense run that trains"
     )
 
 
@@ -87,8 +87,8 @@ def test_cells_of_the_same_runs_are_counted_once() -> None:
         (cell("pass"), "the case equal must fail, and its verdict is pass"),
         (cell("degraded"), "the case equal must fail, and its verdict is degraded"),
         (
-            cell("fail", None, psnr=None, reason="1 of 1 runs ended: out of memory"),
-            "the case equal must fail by its figures; 1 of 1 runs ended: out of memory",
+            cell("fail", None, psnr=None, reason="1 of 1 run ended: out of memory"),
+            "the case equal must fail by its figures; 1 of 1 run ended: out of memory",
         ),
     ],
 )
@@ -116,7 +116,7 @@ def test_every_failure_says_why() -> None:
 
 def test_a_cell_that_was_not_run_or_does_not_exist_is_shown_as_such() -> None:
     unknown = cell("no reference", None, psnr=None, seeds=0, reason="not run")
-    broken = cell("fail", None, psnr=None, reason="1 of 1 runs ended: no memory")
+    broken = cell("fail", None, psnr=None, reason="1 of 1 run ended: no memory")
     text = table(results(("yard", False, {"learned": unknown}), ("fog", False, {"dense": broken})))
     assert "| yard | -: not run |  |  |" in text
     assert "| fog |  |  | **fail**: no result |" in text

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from leco_plugin.log import summarize
+from leco_plugin.log import counted, summarize
 from leco_plugin.models.compute.device import memory_of
 from leco_plugin.models.sizing.sizes import (
     Sizes,
@@ -96,7 +96,8 @@ def summary(sizes: Sizes, images: int) -> str:
     encoding, experts, gate = sizes.field.encoding, sizes.field.experts, sizes.gate
     return (
         f"sizes: field {values_of(sizes, images):,} parameters, {encoding.levels} levels of "
-        f"2^{encoding.log2_table} up to {encoding.finest} cells, {experts.scene_experts} experts "
+        f"2^{encoding.log2_table} up to {encoding.finest} cells, "
+        f"{counted(experts.scene_experts, 'expert')} "
         f"{experts.width} wide; gate {gate.encoding.octaves} octaves, {gate.width} wide"
     )
 
@@ -200,7 +201,8 @@ def explain(
     if detail is not None:
         head = (
             f"sizes for a surface of {detail.texels:,.0f} texels in {detail.pixels:,} pixels of "
-            f"{detail.images} photographs, in a cube of {detail.across:,.0f} texels a side:"
+            f"{counted(detail.images, 'photograph')}, in a cube of {detail.across:,.0f} texels a "
+            "side:"
         )
 
     def row(name: str, at: str, reason: str, power: bool = False) -> str:

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from leco_plugin.log import by_number
 from leco_plugin.scenes.frames import turn_to_upright
 from leco_plugin.scenes.poses.originals import Position
 from leco_plugin.scenes.whole_files import write_json, write_points
@@ -98,7 +99,8 @@ def place(
     there = np.isfinite(gps).all(axis=1)
     known, count = gps[there], int(there.sum())
     if count < FEWEST:
-        few = f"{count or 'no'} placed photographs have a GPS position"
+        have = by_number(count, "photograph has", "photographs have")
+        few = f"{count or 'no'} placed {have} a GPS position"
         return _by_direction(up, f"{few}, and {FEWEST} are needed")
     spread = float(np.sqrt(((known - known.mean(axis=0)) ** 2).sum(axis=1).mean()))
     options = pycolmap.RANSACOptions()

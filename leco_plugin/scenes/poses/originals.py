@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from PIL import ExifTags, Image
 
+from leco_plugin.log import by_number, counted
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.photograph_files import Header, check_kind, decode, header_of, is_plain
 from leco_plugin.scenes.whole_files import write_whole
@@ -206,15 +207,17 @@ def find_photographs(folder: Path, out: Path) -> Found:
     files = _files_below(folder, out)
     found = [path for path in files if path.suffix.lower() in KINDS]
     if len(found) < FEWEST:
-        number = f"{len(found) or 'no'} photograph{'' if len(found) == 1 else 's'}"
+        number = counted(len(found), "photograph") if found else "no photographs"
         raw = sum(path.suffix.lower() in RAW for path in files)
         films = sum(path.suffix.lower() in FILMS for path in files)
         remedy = "take more, from different places, whose pictures overlap by two thirds"
         if raw:
-            remedy = f"{raw} raw files are not read, save them as JPEG"
+            some = counted(raw, "raw file is", "raw files are")
+            remedy = f"{some} not read, save {by_number(raw, 'it', 'them')} as JPEG"
         elif films:
-            remedy = f"{films} videos are not read: take pictures out of them, two a second, as by "
-            remedy += "ffmpeg -i FILM -vf fps=2 PHOTOS/%05d.jpg"
+            some = counted(films, "video is", "videos are")
+            remedy = f"{some} not read: take pictures out of {by_number(films, 'it', 'them')}"
+            remedy += ", two a second, as by ffmpeg -i FILM -vf fps=2 PHOTOS/%05d.jpg"
         elif not found:
             kinds = ", ".join(sorted(KINDS))
             remedy = f"give the folder that holds them; files that end in {kinds} are read"
@@ -225,7 +228,8 @@ def find_photographs(folder: Path, out: Path) -> Found:
     photographs = [each for path in found if (each := _or_why(_read, path, folder, refused))]
     clear = [each.path for each in photographs if each.header.transparent]
     if clear and len(clear) < len(photographs):
-        some = f"{len(clear)} of {len(photographs)} photographs have an alpha channel"
+        have = by_number(len(clear), "has", "have")
+        some = f"{len(clear)} of {len(photographs)} photographs {have} an alpha channel"
         raise InputError(f"{some}, the first is {clear[0]}: give it to all of them or to none")
     if len({photograph.name.lower() for photograph in photographs}) < len(photographs):
         digits = len(str(len(photographs)))
@@ -259,7 +263,7 @@ def _enough(found: Found) -> Found:
     """What was found. InputError if too much of it cannot be used."""
     used, files = len(found.photographs), len(found.photographs) + len(found.refused)
     if used < FEWEST:
-        left = f"{used} of {files} photographs can be used, and {FEWEST} are needed"
+        left = f"{used} of {counted(files, 'photograph')} can be used, and {FEWEST} are needed"
         raise InputError(f"{next(iter(found.refused.values()))} ({left})")
     return found
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from leco_plugin.evaluation.report import usable_cores
-from leco_plugin.log import bar
+from leco_plugin.log import bar, counted
 from leco_plugin.scenes.bounds import FEWEST_POINTS
 from leco_plugin.scenes.input_error import InputError, require
 from leco_plugin.scenes.lenses import DISTORTIONS, MIXED, Lens
@@ -63,7 +63,8 @@ def find_points(data: Path, size: int = 1600, threads: int = 0) -> dict[str, Any
         there = scene.folder / scene.meta["ply_file_path"]
         return report | {"points": len(known.positions), "file": str(there), "done": False}
     if len(chosen) < FEWEST:
-        raise InputError(f"{scene.path} has {len(chosen)} photographs; {FEWEST} or more are needed")
+        few = counted(len(chosen), "photograph")
+        raise InputError(f"{scene.path} has {few}; {FEWEST} or more are needed")
     load_pycolmap()
     check_place("--data", scene.path.with_name(FILE))
     poses = np.array([scene.frames[number]["transform_matrix"] for number in chosen])[:, :3]
@@ -145,7 +146,7 @@ def _refuse_few(model: Any, matched: int, path: Path) -> None:
         return
     photographs = model.num_reg_images()
     if matched < 4 * FEWEST_POINTS:
-        shared = f"the {photographs} photographs of {path} share {matched} features"
+        shared = f"the {photographs} photographs of {path} share {counted(matched, 'feature')}"
         raise InputError(f"{shared}, too few for points: add photographs between them")
     raise InputError(
         f"only {agreeing} of {matched} features that the photographs share agree with the poses "

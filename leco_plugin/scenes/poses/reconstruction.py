@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from leco_plugin.log import bar
+from leco_plugin.log import bar, counted
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.poses.originals import FEWEST, Exif, Photograph
 
@@ -121,7 +121,7 @@ class Reconstructor:
         pairing = pycolmap.ImportedPairingOptions()
         pairing.match_list_path = self.folder / "pairs.txt"
         names = [each.name for each in self.photographs]
-        with bar(f"comparing {count} pairs ({chosen.reason})") as show:
+        with bar(f"comparing {counted(count, 'pair')} ({chosen.reason})") as show:
             for at in range(0, count, chunk):
                 some = chosen.pairs[at : at + chunk]
                 lines = "".join(f"{names[one]} {names[other]}\n" for one, other in some)

@@ -102,7 +102,7 @@ def test_of_two_views_the_last_is_held_out(small: City) -> None:
 
 
 def test_one_view_is_too_few(small: City) -> None:
-    with pytest.raises(ValueError, match="1 pictures are too few"):
+    with pytest.raises(ValueError, match="1 picture is too few"):
         views_of(small, CaptureConfig(aerial_per_block=0.3, street_per_block=0))
 
 

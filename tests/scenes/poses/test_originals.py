@@ -180,7 +180,7 @@ def test_what_cannot_be_used_is_named_with_a_remedy(folder: Path, tmp_path: Path
     refused(r"IMG_0.jpg cannot be read as an image: .*save it as JPEG.*2 of 3 photographs can be")
     (folder / "IMG_0.jpg").write_bytes(whole)
     Image.new("RGBA", (32, 24)).save(folder / "clear.png")
-    refused(r"1 of 4 photographs have an alpha channel, .*clear.png: give it to all")
+    refused(r"1 of 4 photographs has an alpha channel, .*clear.png: give it to all")
     (folder / "clear.png").unlink()
     (folder / "IMG_0.jpg").unlink()
     refused("has 2 photographs, and 3 or more are needed: take more")
@@ -236,10 +236,10 @@ def test_a_folder_of_raw_files_says_what_to_do(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no photographs, .*give the folder .*\.jpg"):
         find_photographs(tmp_path, tmp_path / "out")
     (tmp_path / "DJI_0001.MP4").write_bytes(b"film")
-    with pytest.raises(InputError, match=r"no photographs, .*1 videos are not read: .* ffmpeg -i"):
+    with pytest.raises(InputError, match=r"no photographs, .*1 video is not read: .* ffmpeg -i"):
         find_photographs(tmp_path, tmp_path / "out")
     (tmp_path / "DJI_0001.DNG").write_bytes(b"raw")
-    with pytest.raises(InputError, match=r"no photographs, .*1 raw files are not read, save them"):
+    with pytest.raises(InputError, match=r"no photographs, .*1 raw file is not read, save it"):
         find_photographs(tmp_path, tmp_path / "out")
 
 
