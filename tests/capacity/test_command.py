@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -159,7 +160,8 @@ def test_one_field_teaches_gates_and_grids(
         for file in (out / "points").glob("grid*"):
             file.unlink()
     other = tiny_scene_writer.write(tmp_path / "other" / tiny_scene.name, train=4, test=2)
-    with pytest.raises(InputError, match="another scene"):
+    refused = f"{out} holds points of another scene than {other}; name a new folder with --out"
+    with pytest.raises(InputError, match=re.escape(refused)):
         measuring.capacity(other, out, (8, 16), 0.01, 4)
     (out / "field.pt").write_bytes(b"no field")
     with pytest.raises(InputError, match=r"field\.pt cannot be used"):
