@@ -214,7 +214,8 @@ def squared_errors(host: Any, bundle: Any, truth: Tensor) -> Tensor:
 
 def _lowered(report: dict[str, Any], before: float, step: int, threshold: float) -> dict[str, Any]:
     """What an occupancy says of itself with a lower threshold. Its figures stay those of the
-    threshold that was calibrated, which it names from then on; of nothing skipped all are known."""
+    threshold that was calibrated, which it names from then on: a host gives no weights to measure
+    others by. Where nothing is skipped all are 0, as `calibration.measure` finds them there too."""
     lowered = {"threshold": threshold, "lowered": [*report.get("lowered", []), [step, threshold]]}
     if threshold > 0.0:
         return {CALIBRATED_AT: before, **report, **lowered}

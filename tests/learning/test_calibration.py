@@ -218,6 +218,13 @@ def test_nothing_is_skipped_when_no_threshold_fits() -> None:
     assert found == (0.0,) * len(found)
 
 
+@pytest.mark.parametrize("missed_only", [False, True])
+def test_skipping_nothing_is_measured_to_cost_exactly_nothing(missed_only: bool) -> None:
+    """So that a host, which cannot measure all of it, may declare zeros."""
+    found = measure(Problem(1).rendering(), 0.0, missed_only=missed_only)
+    assert found == (0.0,) * len(found)
+
+
 def test_a_perfect_gate_gets_the_largest_threshold_for_nothing() -> None:
     problem = Problem(0)
     for chunk in problem.chunks:
