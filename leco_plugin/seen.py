@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn.functional import max_pool3d
 
 from leco_plugin.samplers import marching
+from leco_plugin.samplers.base import midpoints
 from leco_plugin.space import Space
 
 CELLS = 64
@@ -53,10 +54,8 @@ class SeenSpace(nn.Module):
         crossed = torch.zeros(CELLS**3, dtype=torch.bool, device=self.cells.device)
         for first in range(0, len(rays.origins), RAYS_AT_ONCE):
             part = marching.Rays(*(each[first : first + RAYS_AT_ONCE] for each in rays[:4]))
-            of_ray, starts, ends = marching.march(part, rule)
-            middles = (0.5 * (starts + ends))[:, None]
-            positions = torch.addcmul(part.origins[of_ray], part.directions[of_ray], middles)
-            mapped = space.map(positions)
+            samples = marching.march(part, rule)
+            mapped = space.map(midpoints(samples, part.origins, part.directions))
             inside = mapped.abs().amax(dim=-1) <= 1.0
             crossed[cells_at(mapped[inside])] = True
         grid = crossed.view(1, 1, *self.cells.shape).float()

@@ -15,7 +15,7 @@ from leco_plugin.conformance.proposals import ProposalCase
 from leco_plugin.conformance.rules import RULES, Case, Rule, Verdict, apply, left_as_before
 from leco_plugin.conformance.samplers import SamplerCase
 from leco_plugin.conformance.scene import SLAB
-from leco_plugin.samplers.registry import GROUP, SamplerSpec, sampler_spec, samplers, why_left_out
+from leco_plugin.samplers.registry import sampler_spec, samplers, why_left_out
 from leco_plugin.scenes.input_error import InputError
 
 
@@ -65,7 +65,7 @@ def host_cases(name: str) -> list[Case]:
 def cases_of(name: str) -> list[Case]:
     """A sampler or a method; of a name that is both, the sampler. `ValueError` for neither."""
     known = samplers()
-    if ":" in name or name in known or why_left_out(GROUP, SamplerSpec, name) is not None:
+    if ":" in name or name in known or why_left_out(name) is not None:
         return sampler_cases(name)
     from nerfstudio.configs.method_configs import all_methods
 

@@ -23,6 +23,7 @@ from leco_plugin.learning.quality import (
 from leco_plugin.models.region import cut_rays, marching_rule, within_crop
 from leco_plugin.occupancy import SEEN_CELLS, Occupancy
 from leco_plugin.samplers import marching
+from leco_plugin.samplers.base import midpoints
 from leco_plugin.scenes.coloured_points import (
     ColouredPoints,
     camera_places,
@@ -263,9 +264,8 @@ def ray_states(
         origins, directions: [R, 3] in the occupancy's coordinates, unit vectors.
         crop: nears and fars of the rays, [R] or [R, 1], scene units; None is no crop.
     """
-    of_ray, starts, ends = candidates(occupancy, origins, directions, crop)
-    middles = (0.5 * (starts + ends))[:, None]
-    positions = torch.addcmul(origins[of_ray], directions[of_ray], middles)
+    samples = candidates(occupancy, origins, directions, crop)
+    of_ray, positions = samples[0], midpoints(samples, origins, directions)
     states = torch.full((len(origins),), SKIPPED, device=origins.device)
     states[of_ray[occupancy.unseen(positions)]] = UNSEEN
     states[of_ray[occupancy.query(positions) >= occupancy.threshold_value]] = KEPT

@@ -11,6 +11,7 @@ from leco_plugin.models.compute.dispatch import select_rows
 from leco_plugin.models.compute.learned import Colors
 from leco_plugin.models.field import ColorHead, HMoEField
 from leco_plugin.models.gate import EMPTY, Gate, route
+from leco_plugin.samplers.base import midpoints
 from leco_plugin.samplers.packed import (
     accumulate_along_rays,
     pack_info,
@@ -201,13 +202,7 @@ def backdrop_ends(rays: Rays) -> Tensor:
 
 def mapped_middles(space: Space, rays: Rays, intervals: Intervals) -> Tensor:
     """Middles of packed intervals as gate and field take them: [M, 3] in [-1, 1]."""
-    ray_indices, t_starts, t_ends = intervals
-    positions = torch.addcmul(
-        rays.origins.index_select(0, ray_indices),
-        rays.directions.index_select(0, ray_indices),
-        (0.5 * (t_starts + t_ends))[:, None],
-    )
-    return space.map(positions).clamp(-1.0, 1.0)
+    return space.map(midpoints(intervals, rays.origins, rays.directions)).clamp(-1.0, 1.0)
 
 
 def shade(scene: Scene, rays: Rays, intervals: Intervals, freeze_gate: bool) -> Shaded:

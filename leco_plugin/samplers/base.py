@@ -62,9 +62,6 @@ def _mark(tensor: Tensor) -> tuple[int, int]:
 SampleFn = Callable[[Tensor, Tensor, Tensor], Tensor]
 """t_starts [N], t_ends [N], ray_indices [N] to densities or opacities [N]."""
 
-DensityFn = Callable[[Tensor], Tensor]
-"""Positions [N, 3] to densities [N] or [N, 1]."""
-
 
 class Estimator(nn.Module):
     """Marches rays and keeps what a subclass calls occupied."""
@@ -237,13 +234,20 @@ def prune(
     return ray_indices, t_starts, t_ends
 
 
-def densities_of_samples(density_fn: DensityFn, rays_o: Tensor, rays_d: Tensor) -> SampleFn:
-    """Density of samples from the density of positions, asked at the midpoints."""
+def midpoints(samples: Samples, rays_o: Tensor, rays_d: Tensor) -> Tensor:
+    """Positions in the middle of samples [n_samples, 3], along rays [n_rays, 3]."""
+    ray_indices, t_starts, t_ends = samples
+    origins, directions = (rays.index_select(0, ray_indices) for rays in (rays_o, rays_d))
+    return torch.addcmul(origins, directions, ((t_starts + t_ends) * 0.5)[:, None])
+
+
+def densities_of_samples(
+    density_fn: Callable[[Tensor], Tensor], rays_o: Tensor, rays_d: Tensor
+) -> SampleFn:
+    """Density of samples from that of positions, [N, 3] to [N] or [N, 1], at the midpoints."""
 
     def sigma_fn(t_starts: Tensor, t_ends: Tensor, ray_indices: Tensor) -> Tensor:
-        midpoints = ((t_starts + t_ends) * 0.5)[:, None]
-        origins, directions = (rays.index_select(0, ray_indices) for rays in (rays_o, rays_d))
-        return density_fn(torch.addcmul(origins, directions, midpoints)).reshape(-1)
+        return density_fn(midpoints((ray_indices, t_starts, t_ends), rays_o, rays_d)).reshape(-1)
 
     return sigma_fn
 

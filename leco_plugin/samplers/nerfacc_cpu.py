@@ -175,7 +175,9 @@ def traverse_grids(
     if t_sorted is None or t_indices is None or hits is None:
         t_enters, t_leaves = intersect_box(rays_o, rays_d, aabbs[-1])
     else:
-        t_enters, t_leaves = _first_and_last(t_sorted, hits.gather(1, t_indices % len(aabbs)))
+        crossed = hits.gather(1, t_indices % len(aabbs))
+        t_enters = t_sorted.where(crossed, torch.inf).amin(dim=1)
+        t_leaves = t_sorted.where(crossed, -torch.inf).amax(dim=1)
     if far_planes is not None:
         t_leaves = t_leaves.minimum(far_planes)
     if rays_mask is not None:
@@ -185,15 +187,7 @@ def traverse_grids(
     occupied = functools.partial(lookup, binaries, aabbs[0])
     samples, left = _first_samples(rays, March(step_size, cone_angle), occupied, limit)
     intervals, middles = _shared_edges(*samples, len(rays_o))
-    if not hasattr(middles, "is_valid"):  # 0.5.2
-        return intervals, middles
-    return intervals, middles, left
-
-
-def _first_and_last(t_sorted: Tensor, crossed: Tensor) -> tuple[Tensor, Tensor]:
-    """The first and the last crossing of each ray, [n_rays]; (inf, -inf) where it crosses none."""
-    first, last = t_sorted.where(crossed, torch.inf), t_sorted.where(crossed, -torch.inf)
-    return first.amin(dim=1), last.amax(dim=1)
+    return (intervals, middles, left) if hasattr(middles, "is_valid") else (intervals, middles)
 
 
 def _first_samples(

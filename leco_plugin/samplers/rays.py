@@ -125,6 +125,11 @@ class March(NamedTuple):
     cone_angle: float = 0.0
     """Growth of the step with distance, >= 0; 0 is a constant step."""
 
+    @property
+    def fits_kernels(self) -> bool:
+        """Whether kernels can have the powers of a growing step in a table."""
+        return self.cone_angle <= 0.0 or powers_needed(*self) <= MOST_POWERS
+
 
 class Candidates(NamedTuple):
     """The candidates of a batch of rays; only their numbers are stored."""
@@ -169,6 +174,21 @@ class Candidates(NamedTuple):
     def numbers(self, end: int, step: int = 1) -> Tensor:
         """0, `step`, 2 `step` and so on, below `end`, of the type of t."""
         return torch.arange(0, end, step, dtype=self.t_mins.dtype, device=self.t_mins.device)
+
+    def for_kernels(self) -> tuple[Tensor, Tensor | None]:
+        """What a kernel computes edges from.
+
+        Returns:
+            [5, n_rays]: t of edge 0, number of the first step, number of candidates, and number and
+            t of the edge from which the step grows; and `growth_table`, None of a constant step.
+        """
+        step_size, cone_angle = self.rule
+        switches, growth = (self.t_mins, self.t_mins), None
+        if cone_angle > 0.0:
+            switches = switch(self.t_mins, step_size, cone_angle)
+            growth = growth_table(step_size, cone_angle, self.t_mins.device)
+        first = self.first.expand_as(self.counts)
+        return torch.stack([self.t_mins, first, self.counts, *switches]), growth
 
 
 def plan(rays: Rays, rule: March) -> tuple[Candidates, int, int]:

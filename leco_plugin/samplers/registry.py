@@ -130,7 +130,7 @@ def sampler_spec(name: str) -> SamplerSpec:
         return OURS[name]
     known = samplers()
     if name not in known:
-        why = why_left_out(GROUP, SamplerSpec, name)
+        why = why_left_out(name)
         if why is not None:
             raise ValueError(f"the sampler {name!r} is registered, but {why}")
         raise ValueError(f"there is no sampler {name!r}; there are {', '.join(sorted(known))}")
@@ -282,10 +282,10 @@ def foreign_entries(
     return loaded
 
 
-def why_left_out(group: str, kind: type[Kind], name: str) -> str | None:
-    """What is wrong with a registered entry; None where nothing is, or none has this name."""
-    for entry in entry_points(group=group):
-        found = _load_entry(entry, kind) if entry.name == name else None
+def why_left_out(name: str) -> str | None:
+    """What is wrong with a registered sampler; None where nothing is, or none has this name."""
+    for entry in entry_points(group=GROUP):
+        found = _load_entry(entry, SamplerSpec) if entry.name == name else None
         if isinstance(found, str):
             return found
     return None

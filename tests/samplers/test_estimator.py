@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 
 import pytest
@@ -273,6 +274,24 @@ def test_rays_that_do_not_fit_are_named(bare):
             bare.sampling(**{"rays_o": origins, "rays_d": directions, **wrong})
 
 
+@pytest.mark.parametrize(
+    ("step_size", "cone_angle", "said"),
+    [
+        (0.0, 0.01, "step_size must be positive and finite, got 0.0"),
+        (torch.inf, 0.01, "step_size must be positive and finite, got inf"),
+        (0.01, torch.inf, "cone_angle must be finite and not negative, got inf"),
+    ],
+)
+def test_a_march_that_cannot_be_is_refused_in_the_same_words_with_cells(
+    learned, bare, step_size, cone_angle, said
+):
+    for estimator in (learned, bare):
+        with pytest.raises(ValueError, match=said):
+            estimator.sampling(
+                *camera_rays(3), far_plane=4.0, render_step_size=step_size, cone_angle=cone_angle
+            )
+
+
 def test_what_is_no_occupancy_is_refused_in_a_line():
     with pytest.raises(TypeError, match=r"^Occupancy\.load\(FILE\) gives an .*; a str is none$"):
         LearnedOccupancyEstimator("box.safetensors")
@@ -294,6 +313,18 @@ def test_rays_in_other_coordinates_are_named_once(kind, caplog):
     given = LearnedOccupancyEstimator(Balls(kind), [5.0] * 3 + [6.0] * 3, cache_bytes=0)
     given.sampling(origins, directions, far_plane=4.0)
     assert not caplog.records
+
+
+def test_an_occupancy_in_double_precision_keeps_what_it_keeps_in_single():
+    rays = camera_rays(400)
+    one, other = (
+        LearnedOccupancyEstimator(occupancy, cache_bytes=BUDGET).sampling(
+            *rays, render_step_size=0.05, far_plane=8.0
+        )
+        for occupancy in (ball(), copy.deepcopy(ball()).double())
+    )
+    assert len(one[0]) > 100
+    assert all(map(torch.equal, one, other))
 
 
 def test_rays_may_be_in_double_precision():

@@ -89,7 +89,7 @@ def build_cache(
     if device.type == "mps":  # lacks some of what judging takes, none of what looking up takes
         cpu = copy.deepcopy(occupancy).to("cpu")  # type: ignore[attr-defined]
         cache = build_cache(cpu, budget=budget, tolerance=tolerance, check_points=check_points)
-        return CellCache(cache.tables().to(device), occupancy.space, cache.report)
+        return cache.to(device)
     probe, seen = look(occupancy, PROBE)
     enough = _finest_of_use(probe)
     compared = _decisions(occupancy, probe != EMPTY, check_points)

@@ -93,10 +93,6 @@ class Tables(NamedTuple):
         """Memory of all tables."""
         return sum(table.numel() * table.element_size() for table in self)
 
-    def to(self, device: torch.device) -> Tables:
-        """The same on another device."""
-        return Tables(*(table.to(device) for table in self))
-
 
 class CellCache(nn.Module):
     """Lookup of cell decisions; build one with `cells.build.build_cache`.
@@ -139,8 +135,8 @@ class CellCache(nn.Module):
             "clearance": tables.clearance,
             "scale": scale.float().view(1, 1),
             "shift": shift.float().view(3, 1),
-            "center": center.view(3, 1),
-            "half_extent": half_extent,
+            "center": center.float().view(3, 1),
+            "half_extent": half_extent.float(),
         }
         # No buffers: data-parallel training sends every buffer to all ranks before each step, and
         # its back ends know no int16. Each rank derives the same from the gate.

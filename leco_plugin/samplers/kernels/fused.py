@@ -30,15 +30,7 @@ from leco_plugin.samplers.kernels.gate_weights import (
     why_not,
 )
 from leco_plugin.samplers.marching import Samples
-from leco_plugin.samplers.rays import (
-    MOST_POWERS,
-    Candidates,
-    March,
-    Rays,
-    TooManyCandidates,
-    number,
-    powers_needed,
-)
+from leco_plugin.samplers.rays import Candidates, March, Rays, TooManyCandidates, number
 
 _log = logging.getLogger(__name__)
 
@@ -125,7 +117,7 @@ def march(occupancy: object, cache: CellCache | None, rays: Rays, rule: March) -
     if weights is None or weights.padded_width > WIDEST_MARCH:
         return None
     candidates = number(rays, rule)
-    if growing and powers_needed(*rule) > MOST_POWERS:
+    if not rule.fits_kernels:
         return None
     kind = "march with growing steps" if growing else "march"
     compare = functools.partial(compare_march, occupancy, cache, weights, growing)

@@ -28,8 +28,6 @@ from leco_plugin.samplers.rays import (
     MAX_CANDIDATES_PER_RAY,
     Candidates,
     check_longest,
-    growth_table,
-    switch,
 )
 
 STEPS = 32
@@ -284,17 +282,14 @@ def march_kept(cache: CellCache, weights: GateWeights, candidates: Candidates) -
     Raises:
         ValueError: a ray would have more than 2^24 candidates.
     """
-    coordinates, t_mins, first, counts, (step_size, cone_angle) = candidates
+    coordinates, _, first, counts, (step_size, _) = candidates
     n_rays, device = len(counts), counts.device
     if not n_rays:
         return _room(0, device)
-    coned = cone_angle > 0.0
-    switches = switch(t_mins, step_size, cone_angle) if coned else (t_mins, t_mins)
-    numbers = torch.stack([t_mins, first.expand_as(counts), counts, *switches])
-    growth = growth_table(step_size, cone_angle, device) if coned else numbers
+    numbers, powers = candidates.for_kernels()
+    growth = numbers if powers is None else powers  # of a constant step none is read
     coarse, fine, first_plane, planes, clearance = cache.tables()
-    frame = torch.cat([cache.scale.view(-1), cache.shift.view(-1)])
-    cells = (coarse, fine, first_plane, planes, planes.shape[1], clearance, frame)
+    cells = (coarse, fine, first_plane, planes, planes.shape[1], clearance, cache.frame)
     found = torch.zeros(n_rays, dtype=torch.int64, device=device)
     nowhere = torch.zeros_like(found)
 
@@ -306,7 +301,7 @@ def march_kept(cache: CellCache, weights: GateWeights, candidates: Candidates) -
             *cells,
             *weights.values,
             STEPS=STEPS,
-            CONED=coned,
+            CONED=powers is not None,
             RESOLUTION=cache.resolution,
             **weights.sizes,
             num_warps=max(1, weights.padded_width // 32),

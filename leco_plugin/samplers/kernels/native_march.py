@@ -11,16 +11,7 @@ from torch import Tensor
 from leco_plugin.models.compute import native
 from leco_plugin.samplers.cells.cache import CellCache
 from leco_plugin.samplers.marching import OccupiedFn, Samples, join
-from leco_plugin.samplers.rays import (
-    MOST_POWERS,
-    Candidates,
-    March,
-    Rays,
-    growth_table,
-    plan,
-    powers_needed,
-    switch,
-)
+from leco_plugin.samplers.rays import Candidates, March, Rays, plan
 
 CANDIDATES_AT_ONCE = 1 << 22
 """That room is made for: 17 bytes each, of which only what is kept is touched."""
@@ -37,12 +28,11 @@ def march(occupied: OccupiedFn, cache: CellCache | None, rays: Rays, rule: March
     Raises:
         ValueError: as `marching.march`.
     """
-    growing = rule.cone_angle > 0.0
     if cache is None or not native.suits(rays.origins, cache.scale):
         return None
-    if growing and powers_needed(*rule) > MOST_POWERS:
-        return None
     candidates, _, longest = plan(rays, rule)
+    if not rule.fits_kernels:
+        return None
     at_once = max(1, CANDIDATES_AT_ONCE // max(longest, 1))
     parts = []
     for first in range(0, len(candidates.counts), at_once):
@@ -68,10 +58,9 @@ def march(occupied: OccupiedFn, cache: CellCache | None, rays: Rays, rule: March
 
 def _march(cache: CellCache, candidates: Candidates) -> tuple[Samples, Tensor]:
     """What cells keep or leave open, and which of it they leave open: bool [n_samples]."""
-    coordinates, t_mins, first, counts, (step_size, cone_angle) = candidates
-    growing, room = cone_angle > 0.0, counts.long()
+    room = candidates.counts.long()
     total = int(room.sum())
-    switches = switch(t_mins, step_size, cone_angle) if growing else (t_mins, t_mins)
+    numbers, powers = candidates.for_kernels()
     samples = {
         "ray_indices": torch.empty(total, dtype=torch.int64),
         "t_starts": torch.empty(total),
@@ -84,9 +73,9 @@ def _march(cache: CellCache, candidates: Candidates) -> tuple[Samples, Tensor]:
         "march_cells",
         rooms,
         {
-            "coordinates": coordinates.contiguous(),
-            "numbers": torch.stack([t_mins, first.expand_as(counts), counts, *switches]),
-            "powers": growth_table(step_size, cone_angle, t_mins.device) if growing else None,
+            "coordinates": candidates.coordinates.contiguous(),
+            "numbers": numbers,
+            "powers": powers,
             "rooms": rooms,
             "coarse": coarse,
             "first_plane": first_plane,
@@ -95,14 +84,15 @@ def _march(cache: CellCache, candidates: Candidates) -> tuple[Samples, Tensor]:
             "planes": planes.contiguous(),
             "frame": cache.frame,
             **samples,
-            "step_size": step_size,
-            "rays": len(counts),
+            "step_size": candidates.rule.step_size,
+            "rays": len(room),
             "all_planes": planes.shape[1],
             "resolution": cache.resolution,
             "contracted": int(cache.contracted),
             "wide": int(coarse.dtype == torch.int32),
         },
     )
-    *kept, left_open = (torch.cat([each[part] for part in found]) for each in samples.values())
-    ray_indices, t_starts, t_ends = kept
+    ray_indices, t_starts, t_ends, left_open = (
+        torch.cat([each[part] for part in found]) for each in samples.values()
+    )
     return (ray_indices, t_starts, t_ends), left_open
