@@ -33,7 +33,7 @@ from leco_plugin.conformance.scene import (
     Rays,
     box,
 )
-from leco_plugin.hosts.stand_ins import GuidedEstimator, GuidedProposal
+from leco_plugin.hosts.stand_ins import GuidedEstimator, GuidedProposal, is_packed
 from leco_plugin.samplers.base import DenseEstimator, Estimator
 from leco_plugin.samplers.marching import Samples
 
@@ -43,11 +43,6 @@ if TYPE_CHECKING:
 
 DENSE = 512
 """Samples of each ray of a proposal host that is sampled densely."""
-
-
-def is_packed(model: Model) -> bool:
-    """Whether the host shades only what its sampler keeps, and not a fixed number a ray."""
-    return any(isinstance(module, GuidedEstimator) for module in model.modules())
 
 
 @torch.no_grad()

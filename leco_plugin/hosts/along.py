@@ -19,12 +19,11 @@ from torch import Tensor
 from leco_plugin.evaluation.clock import seconds_now
 from leco_plugin.hosts.guide import Guide
 from leco_plugin.hosts.host_watch import squared_errors
-from leco_plugin.hosts.stand_ins import GuidedEstimator
+from leco_plugin.hosts.stand_ins import is_packed
 from leco_plugin.learning.calibration import (
     ERRORS,
     LOSSES,
     THRESHOLDS,
-    CalibrationConfig,
     Measured,
     added_costs,
     image_price,
@@ -41,7 +40,7 @@ from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.region import Region
 from leco_plugin.models.rendering import Intervals
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.samplers.base import prune
+from leco_plugin.samplers.base import midpoints, prune
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.packed import accumulate_along_rays, pack_info, render_weight_from_density
 from leco_plugin.scenes.input_error import InputError
@@ -115,7 +114,7 @@ class Along:
     def __init__(
         self, host: Any, guide: Guide, config: LecoModelConfig, pipeline: Any, run: Run
     ) -> None:
-        if not any(isinstance(module, GuidedEstimator) for module in host.modules()):
+        if not is_packed(host):
             raise InputError(NO_DENSITIES)
         if config.sharpening.steps == 0:
             raise InputError(f"with sharpening.steps 0 a host teaches its gate nothing: {INSTEAD}")
@@ -234,8 +233,7 @@ class Along:
 
     def _calibrated(self, gate: Gate, heard: Heard, bundle: Any, truth: Tensor) -> Measured | None:
         """The largest threshold within the bounds, and what it costs; None where none is."""
-        config: CalibrationConfig = self.config.calibration
-        before = self.guide.the_occupancy()
+        config, before = self.config.calibration, self.guide.the_occupancy()
         asked = before.with_gate(gate, THRESHOLDS[0], {})
         with torch.no_grad():
             reference = heard.reference(asked.of_mapped(heard.mapped))
@@ -273,7 +271,7 @@ def _heard_of(
 ) -> Heard:
     """What a field says at candidates: it is asked where the occupancy keeps them."""
     of_rays, starts, ends = samples
-    middles = torch.addcmul(rays_o[of_rays], rays_d[of_rays], ((starts + ends) * 0.5)[:, None])
+    middles = midpoints(samples, rays_o, rays_d)
     kept = occupancy.occupied(middles)
     density = options.get("sigma_fn")
     if density is None:

@@ -12,7 +12,7 @@ import copy
 import functools
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import torch
 import tyro
@@ -39,16 +39,11 @@ from leco_plugin.scenes.survey import places_of
 from leco_plugin.studio.checkpoints import prepare_checkpoints
 from leco_plugin.studio.hash_encoding import speed_up_hash_encodings
 from leco_plugin.studio.host_models import lazy_lpips
-from leco_plugin.studio.occupancy_view import Drawn, DrawnInViewer, OccupancyView
+from leco_plugin.studio.occupancy_view import Drawn, DrawnInViewer, ModelAfter, OccupancyView
 from leco_plugin.studio.run_folder import run_of
 
-if TYPE_CHECKING:
-    _Model = Model
-else:
-    _Model = object  # what follows it among the bases is the model
 
-
-class Host(_Model):
+class Host(ModelAfter):
     """Stands before any nerfstudio model among the bases of a class. Its images can be drawn and
     scored without a network."""
 
@@ -175,9 +170,8 @@ def hide_unseen_backdrop(
     asked = renderer.background_color if asked is None else asked
     rgb = kwargs["rgb"] if "rgb" in kwargs else args[0]
     unseen = guide.without_backdrop
-    if unseen is None or not isinstance(asked, str) or asked != "last_sample":
-        return None
-    if len(unseen) != len(rgb):
+    shows_last = isinstance(asked, str) and asked == "last_sample"
+    if unseen is None or not shows_last or len(unseen) != len(rgb):
         return None
     last = torch.nan_to_num(rgb[..., -1, :])
     return args, kwargs | {"background_color": last.masked_fill(unseen, 0.0)}

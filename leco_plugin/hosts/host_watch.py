@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from leco_plugin.evaluation.clock import seconds_now
 from leco_plugin.hosts.guide import Guide
-from leco_plugin.hosts.stand_ins import GuidedEstimator
+from leco_plugin.hosts.stand_ins import is_packed
 from leco_plugin.learning.calibration import THRESHOLDS, CalibrationConfig, Measured
 from leco_plugin.learning.collapse import SUSPECTED_STEPS
 from leco_plugin.learning.dense import evaluating
@@ -62,9 +62,7 @@ def set_first_density(host: nn.Module, guide: Guide) -> None:
 
 def _scaled(host: nn.Module) -> list[nn.Module]:
     """What has that density to set in a host whose samples are packed: its fields, or itself."""
-    if not any(isinstance(module, GuidedEstimator) for module in host.modules()):
-        return []
-    return [module for module in host.modules() if hasattr(module, SCALE)]
+    return [each for each in host.modules() if hasattr(each, SCALE)] if is_packed(host) else []
 
 
 CAREFUL = 1.0 / 16.0
@@ -79,7 +77,7 @@ ANYTHING = 1e-30
 def begin_carefully(host: nn.Module, guide: Guide, skipped: Callable[[Occupancy], float]) -> bool:
     """Has a packed host follow a lower threshold for the beginning; returns whether it does.
     `skipped` says what share of what the cameras see an occupancy skips."""
-    if not any(isinstance(module, GuidedEstimator) for module in host.modules()):
+    if not is_packed(host):
         return False
     occupancy = guide.the_occupancy()
     lower = from_first(lambda: _first_threshold(occupancy, skipped), guide.frame.device)

@@ -207,6 +207,11 @@ class GuidedEstimator(_StandIn):
         return super().__getattr__(name)
 
 
+def is_packed(host: nn.Module) -> bool:
+    """Whether a guided host shades only what its sampler keeps, and not a fixed number a ray."""
+    return any(isinstance(module, GuidedEstimator) for module in host.modules())
+
+
 class GuidedProposal(_StandIn, Sampler):
     """A proposal sampler of the registry, in the host's coordinates."""
 

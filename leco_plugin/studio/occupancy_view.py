@@ -25,9 +25,9 @@ from leco_plugin.scenes.frames import moved, turned
 from leco_plugin.studio.viewer import FirstView
 
 if TYPE_CHECKING:
-    _Model = Model
+    ModelAfter = Model
 else:
-    _Model = object  # what follows it among the bases is the model
+    ModelAfter = object  # what follows a class of ours among the bases is the model
 
 STEP = 1e-3
 """Of the slider, and the most by which it stands beside the run's threshold at rest."""
@@ -115,17 +115,17 @@ class OccupancyView(nn.Module):
 
 def with_states(rgb: Tensor, drawn: Drawn, rays: Any) -> Tensor:
     """Colours [R, 3] of a picture with those of what the occupancy says along its rays."""
-    origins, directions, limits = rays.origins, rays.directions, (rays.nears, rays.fars)
+    origins, directions = rays.origins, rays.directions
     if drawn.frame is not None:
         origins, directions = moved(origins, drawn.frame), turned(directions, drawn.frame)
     lengths = directions.norm(dim=-1, keepdim=True)
-    crop = tuple(None if each is None else each * lengths for each in limits)
-    states = ray_states(drawn.occupancy, origins, directions / lengths, (crop[0], crop[1]))
+    near, far = (None if each is None else each * lengths for each in (rays.nears, rays.fars))
+    states = ray_states(drawn.occupancy, origins, directions / lengths, (near, far))
     strengths = torch.tensor(STRENGTHS).to(rgb)[states][:, None]
     return torch.lerp(rgb, torch.tensor(COLOURS).to(rgb)[states], strengths)
 
 
-class DrawnInViewer(_Model):
+class DrawnInViewer(ModelAfter):
     """Stands before a model whose occupancy nerfstudio's viewer shows; one without `leco_view`, the
     controls, has none to show."""
 
