@@ -22,7 +22,7 @@ from leco_plugin.scenes.input_error import ANOTHER_VERSION, InputError, Training
 PACKAGE = "leco_plugin"
 
 
-def is_ns_command(program: str) -> bool:
+def is_ns_command(program: str | Path) -> bool:
     """Whether a program, `sys.argv[0]`, is nerfstudio's: `ns-train` and the like, or, with `python
     -m`, a file of `nerfstudio/scripts`."""
     path = Path(program)
@@ -33,7 +33,7 @@ def is_ns_command(program: str) -> bool:
 def show_one_line_in_ns_commands() -> None:
     """In a process of such a command, uncaught errors that a user can act on are one line."""
     otherwise = sys.excepthook
-    if hasattr(otherwise, "of_leco_plugin") or not any(map(is_ns_command, sys.argv[:1])):
+    if hasattr(otherwise, "of_leco_plugin") or not is_ns_command(Path(*sys.argv[:1])):
         return
 
     def show(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
@@ -51,7 +51,7 @@ def render_images_without_ffmpeg() -> None:
     """In `ns-render`, only a film needs ffmpeg, and an InputError says so where it is missing;
     nerfstudio asks for it before images, too."""
     program = Path(*sys.argv[:1])
-    if not is_ns_command(str(program)) or program.stem not in ("ns-render", "render"):
+    if not is_ns_command(program) or program.stem not in ("ns-render", "render"):
         return
     from nerfstudio.utils import install_checks
 
@@ -95,10 +95,10 @@ def quiet_imports_of_our_methods() -> None:
     Called by the first module of this package that nerfstudio imports, its readers. What it warns
     of earlier cannot be kept from the screen.
     """
-    program = Path(*sys.argv[:1]).name
-    trains = program.startswith(("ns-train", "train"))
+    program = Path(*sys.argv[:1])
+    trains = program.name.startswith(("ns-train", "train"))
     ours = "".join(sys.argv[1:2]).startswith("leco-")
-    if is_ns_command(*sys.argv[:1]) and (not trains or ours):
+    if is_ns_command(program) and (not trains or ours):
         hide_warnings_of_no_use()
 
 

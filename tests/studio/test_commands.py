@@ -194,6 +194,7 @@ def test_a_path_through_one_photograph_is_a_line(views: int) -> None:
         (["ns-train", "leco-ngp"], True),
         (["ns-train", "nerfacto"], False),
         (["notebook"], False),
+        ([], False),  # of a program that Python is a part of
     ],
 )
 def test_warnings_of_no_use_are_hidden_but_where_another_method_trains(
