@@ -118,8 +118,7 @@ class Guide(nn.Module):
 
     def set_occupancy(self, occupancy: Occupancy, frame: Tensor | None = None) -> None:
         """Guides by this occupancy from now on; `frame` as the attribute, None for no change."""
-        self.occupancy = occupancy.to(self.frame.device).eval()
-        self.occupancy.requires_grad_(False)
+        self.occupancy = occupancy.to(self.frame.device).eval().requires_grad_(False)
         if frame is not None:
             self.frame.copy_(frame)
         self.changed()
@@ -164,9 +163,8 @@ class Guide(nn.Module):
         """Whether training has never seen the backdrop of rays: bool [R]. Origins and directions
         [R, 3], of any length, are in the occupancy's coordinates."""
         unit = torch.nn.functional.normalize(directions.float(), dim=-1)
-        region: Region = self._region()
-        cut = region.cut(origins.float(), unit)
-        return ~region.shows_backdrop(cut)
+        region = self._region()
+        return ~region.shows_backdrop(region.cut(origins.float(), unit))
 
     def estimator(
         self,

@@ -181,8 +181,7 @@ class HostWatch:
                 dense = squared_errors(host, bundle, truth)
         finally:
             guide.dense, guide.kept = False, kept
-        excess = gated - 10.0 ** (0.1 * config.image_price_db) * dense
-        return {"the image price": excess}
+        return {"the image price": gated - 10.0 ** (0.1 * config.image_price_db) * dense}
 
     def count_rays(self, limit: int) -> float:
         """See `price_watch.PriceSource`."""

@@ -44,8 +44,7 @@ def learn_occupancy(
         model = learn_model(config, pipeline, rays, seconds, rate)
     except InputError as error:
         raise InputError(str(error).replace(OF_LEARNER, OF_HOST)) from None
-    occupancy: Occupancy = model.mixture.occupancy()
-    return occupancy.eval()
+    return model.mixture.occupancy().eval()
 
 
 def learn_model(

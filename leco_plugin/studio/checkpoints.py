@@ -37,10 +37,6 @@ def allow_checkpoint_globals() -> None:
     torch.serialization.add_safe_globals(_FLOAT64_SCALAR)
 
 
-PREVIOUS = "previous"
-"""Ending of the folder, beside that of the checkpoints, with the one before the newest."""
-
-
 def refuse_earlier(state_dict: dict[str, Any], prefix: str, name: str) -> None:
     """InputError for the state of a module of before: one that has anything, but not a name of
     today."""
@@ -50,8 +46,8 @@ def refuse_earlier(state_dict: dict[str, Any], prefix: str, name: str) -> None:
 
 
 def previous_of(checkpoints: Path) -> Path:
-    """The folder with the checkpoint before the newest of a folder of checkpoints."""
-    return checkpoints.with_name(f"{checkpoints.name}.{PREVIOUS}")
+    """The folder, beside that of the checkpoints, with the one before the newest."""
+    return checkpoints.with_name(f"{checkpoints.name}.previous")
 
 
 def damage_of(path: Path) -> str | None:

@@ -108,10 +108,6 @@ def without_tables(config: Any) -> Any:
     return replace(config, logging=replace(logging, local_writer=writer, profiler=profiler))
 
 
-OF_TRAINING = "on training pixels"
-"""Of what PSNR is where a data manager holds out none."""
-
-
 class RunProgress:
     """Stands around the steps of a run until its `end`: a bar with PSNR, and then where everything
     lies."""
@@ -126,11 +122,10 @@ class RunProgress:
         where = TrainingCallbackLocation
         trainer.callbacks.append(TrainingCallback([where.AFTER_TRAIN_ITERATION], self.after_step))
         trainer.callbacks.append(TrainingCallback([where.AFTER_TRAIN], self.finish))
-        folder, viewer = trainer.base_dir, trainer.viewer_state
         if start := getattr(trainer, "_start_step", 0):
             say(f"goes on at step {start}")
-        say(f"run: {folder}" + (f", details in {LOG}" if on_screen() else ""))
-        say_all(getattr(viewer, "viewer_info", None) or ())
+        say(f"run: {trainer.base_dir}" + (f", details in {LOG}" if on_screen() else ""))
+        say_all(getattr(trainer.viewer_state, "viewer_info", None) or ())
 
     def __enter__(self) -> RunProgress:
         self.began = time.monotonic()
@@ -156,9 +151,10 @@ class RunProgress:
         self.of_batch = found.detach() if isinstance(found, Tensor) else found
 
     def _words(self) -> str:
+        """PSNR on held-out pixels, or on those of a batch where a data manager holds out none."""
         if self.psnr.has_pixels or self.of_batch is None:
             return self.psnr.words()
-        return f"{float(self.of_batch):.1f} dB {OF_TRAINING}"
+        return f"{float(self.of_batch):.1f} dB on training pixels"
 
     def finish(self, step: int) -> None:
         """Measures once more, and says what was reached, where it lies, and what to do next."""
