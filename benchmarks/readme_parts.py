@@ -69,7 +69,10 @@ def of_the_papers_host() -> str:
         seconds, scene = results["protocol"]["seconds"], results["scene"]["name"]
         ours, *others = lines_of(results)
         others.sort(key=lambda line: -line.psnr)
-        rest = ", ".join(f"{line.psnr:.1f} with *{line.name}*" for line in others)
+        rest = ", ".join(
+            f"{line.psnr:.1f} with *{line.name}* ({compare(ours.psnrs, line.psnrs).word})"
+            for line in others
+        )
         parts.append(
             f"after {seconds:g} s on `{scene}` {ours.psnr:.1f} dB with a learned occupancy, {rest} "
             f"({describe_seeds(results)})"

@@ -150,16 +150,18 @@ def promise(
 
     Were photographs drawn at random, another one would lose more than the worst of K with a chance
     of 1 in K + 1 at most, because a loss never falls as the threshold rises: split conformal
-    prediction, as in Angelopoulos et al., "Conformal Risk Control", 2022.
+    prediction, as in Angelopoulos et al., "Conformal Risk Control", 2022. Where they chose two
+    thresholds, one after the other, it is 2 in K + 1.
     """
     if not cameras:
         return None
     worst = worst_loss(cameras, measured.threshold) + _worst_so_far(spent)
+    chosen = 2 if spent.get(CAMERAS_THAT_VOUCH) else 1
     return {
         "count": len(cameras),
         "worst_surface_mass": worst,
         "bound": max(worst, config.camera_surface_mass),
-        "confidence": round(len(cameras) / (len(cameras) + 1), 3),
+        "confidence": round((len(cameras) + 1 - chosen) / (len(cameras) + 1), 3),
     }
 
 
@@ -317,6 +319,8 @@ def calibrate(
         return found._replace(**added_costs(found._asdict(), spent)).within(config)
 
     best, earlier = None, _worst_so_far(spent)
+    if earlier > config.camera_surface_mass:
+        earlier = 0.0  # no threshold did justice to that view; others are still looked after
     for threshold in thresholds_below(below):
         beyond = worst_loss(cameras, threshold) + earlier > config.camera_surface_mass
         if best is not None and beyond:

@@ -187,8 +187,7 @@ class Sharpened(NamedTuple):
         """
         measured = self.measured._asdict()
         found = measured | added_costs(measured, before)
-        if self.promised is not None:
-            found[CAMERAS_THAT_VOUCH] = self.promised
+        found[CAMERAS_THAT_VOUCH] = self.promised  # of other photographs nothing is known
         kept = {name: before[name] for name in ("threshold", "params", "empty_fraction", *LOSSES)}
         known = {"learned": {"gate": learned.to_dict(), **kept}}
         return known | before | found | {"params": self.params}

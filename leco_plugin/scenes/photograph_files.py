@@ -64,7 +64,8 @@ def opened(path: Path) -> Iterator[Image.Image]:
     """An image that Pillow has opened, without its warning that a large one may be an attack."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        with Image.open(path) as image:
+        # of a path Pillow maps some turned TIFFs into memory by the wrong sides
+        with path.open("rb") as file, Image.open(file) as image:
             yield image
 
 

@@ -153,6 +153,12 @@ def test_what_a_photograph_has_lost_so_far_counts_against_its_bound() -> None:
     promised = promise(cameras, alone, config, spent)
     assert promised["worst_surface_mass"] == promised["bound"] == allowed + earlier
     assert promise(cameras, measure(problem.rendering(), 0.0), config, spent)["bound"] == allowed
+    assert promised["confidence"] == 0.8  # both thresholds were chosen by the same nine
+    beyond = {CAMERAS_THAT_VOUCH: {"worst_surface_mass": 2.0 * allowed}}
+    config = replace(config, camera_surface_mass=worst_loss(cameras, lower))
+    found = calibrate(problem.rendering(), config, cameras=cameras, spent=beyond)
+    assert found == calibrate(problem.rendering(), config, cameras=cameras)
+    assert found.threshold == lower  # a view that is lost already does not give up the others
 
 
 def test_no_photograph_that_vouches_loses_more_than_its_bound() -> None:

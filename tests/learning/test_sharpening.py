@@ -134,6 +134,20 @@ def test_a_small_gate_skips_what_the_large_one_keeps_of_free_space() -> None:
     assert all(torch.equal(p, p.bfloat16().float()) for p in found.gate.parameters())
 
 
+def test_a_small_gate_may_cost_only_what_the_large_one_has_left() -> None:
+    mixture, bounds = a_mixture(), CalibrationConfig()
+    data = some_rays(mixture, 400), (some_rays(mixture, 100), torch.ones(100, 3))
+    views = [(some_rays(mixture, 50), torch.ones(50, 3))]
+    config = SharpeningConfig(steps=150, gate=GATE)
+    mixture.report = report_of(0.6) | {CAMERAS_THAT_VOUCH: vouched(0.001, 0.002)}
+    found = sharpen(mixture, *data, views, LOSSES, bounds, config)
+    assert found is not None and found.measured.threshold > 0.0 and found.promised is not None
+    assert found.promised["worst_surface_mass"] >= 0.001 and found.promised["confidence"] == 0.0
+    mixture.report |= {"lost_surface_mass": 2.0 * bounds.lost_surface_mass}
+    spent = sharpen(mixture, *data, views, LOSSES, bounds, config)
+    assert spent is not None and spent.measured.threshold == 0.0 and not spent.pays
+
+
 def test_only_what_is_kept_is_taught_and_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
     shares: list[float] = []
     real = sharpening._asked

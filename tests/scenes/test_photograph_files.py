@@ -102,20 +102,22 @@ def test_an_image_is_turned_as_exif_says_whatever_else_that_says(
     np.testing.assert_array_equal(np.asarray(decode(path, turn=True)), wanted)
 
 
+@pytest.mark.parametrize("mode", ["L", "RGB", "RGBA"])
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_a_tiff_is_known_as_pillow_decodes_it_which_sets_it_upright(
-    orientation: int, tmp_path: Path
+    orientation: int, mode: str, tmp_path: Path
 ) -> None:
     """`leco poses` would give its photographs a lens of the other sides."""
     exif = Image.Exif()
     exif[0x112] = orientation
-    with Image.open(write(tmp_path / "a.png", "RGB")) as image:
+    with Image.open(write(tmp_path / "a.png", mode)) as image:
         image.save(tmp_path / "a.tif", exif=exif)
-    header = header_of(tmp_path / "a.tif")
+        image.save(tmp_path / "b.png", exif=exif)
+    header, wanted = header_of(tmp_path / "a.tif"), np.asarray(decode(tmp_path / "b.png", True))
     assert header.orientation == 1
     assert header.size == ((6, 8) if orientation >= 5 else (8, 6))
-    assert header.size == decode(tmp_path / "a.tif", turn=True).size
-    assert header.size == decode(tmp_path / "a.tif", turn=False).size
+    for turn in (True, False):
+        np.testing.assert_array_equal(np.asarray(decode(tmp_path / "a.tif", turn)), wanted)
 
 
 @pytest.mark.parametrize("mode", ["L", "RGB", "RGBA"])
