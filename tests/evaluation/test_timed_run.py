@@ -345,6 +345,25 @@ def test_a_model_that_learns_itself_knows_how_many_steps_are_left_of_its_time(
     assert ends == [module.ENDLESS] * 4 + [4 + 6, 5 + 3, module.ENDLESS]
 
 
+def test_the_steps_left_are_foreseen_by_the_latest_ones(
+    time: Time, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "RECENT", 2)
+    model = learning_model()
+    run = Run(time, model, [1.0, 6.0, 6.0, 4.0, 4.0, 4.0, 9.0, 9.0], monkeypatch)
+    ends = []
+
+    def freeze(step: int) -> None:
+        ends.append(run.trainer.config.max_num_iterations)
+        model.mixture.frozen = True
+
+    run.ends = freeze
+    run.record()
+    # 33 s and 27 s are left for steps of 6 s, 23 s for those of 5, then 19 s and 15 s for those of
+    # 4, and 6 s for those of 6.5
+    assert ends == [module.ENDLESS] * 2 + [2 + 6, 3 + 5, 4 + 5, 5 + 5, 6 + 4, 7 + 1]
+
+
 def test_updates_of_a_grid_are_its_learning_time(
     time: Time, monkeypatch: pytest.MonkeyPatch
 ) -> None:
