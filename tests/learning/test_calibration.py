@@ -17,6 +17,7 @@ from leco_plugin.learning.calibration import (
     Measured,
     backdrop_price,
     calibrate,
+    image_price,
     measure,
     promise,
     ray_prices,
@@ -280,6 +281,13 @@ def test_standard_errors_are_those_of_a_bootstrap_over_rays() -> None:
     )
     assert found.surface_error == pytest.approx(float(masses.std()), rel=0.15)
     assert found.price_error_db == pytest.approx(float(prices.std()), rel=0.15)
+
+
+def test_the_error_of_a_price_is_that_of_two_shares_however_much_is_lost() -> None:
+    """By hand: of a ray with 3/4 of the gated error and 1/2 of the dense one, and one with less."""
+    price, error = image_price(torch.tensor([6.0, 2.0]), torch.tensor([0.5, 0.5]), 0.0)
+    assert price == pytest.approx(10.0 * math.log10(8.0))
+    assert error == pytest.approx(10.0 / math.log(10.0) * math.hypot(0.25, 0.25))
 
 
 def test_one_ray_of_a_few_does_not_decide_and_many_do() -> None:

@@ -119,6 +119,14 @@ def test_a_gate_that_has_called_nothing_empty_yet_has_until_the_end_to_learn_it(
     assert look(progress, 999, 1.0, SPREAD, last=True) is not None
 
 
+def test_a_healed_gate_has_as_long_as_a_new_one_to_call_something_empty() -> None:
+    progress = Progress(learn_steps=200, configured=200)
+    assert look(progress, 99, 0.3, SPREAD, last=False) is None  # it has called much empty
+    heal(head_of([0] * 3), progress, Collapse("a cause", "empty"), SPREAD, 149, GateLossConfig())
+    for step in range(199, 999, 50):
+        assert look(progress, step, 1.0, SPREAD, last=False) is None
+
+
 def test_a_second_recovery_counts_whatever_it_is_from() -> None:
     paper, progress = GateLossConfig(form="paper"), Progress(learn_steps=200)
     for kind in ("empty", "one expert"):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from ball_occupancy import ENCODINGS
@@ -53,6 +55,26 @@ def test_the_same_seed_gives_the_same_gate_and_leaves_other_dice_alone() -> None
     second = teach(config, ball_lesson(1000), 3, "float32")
     for a, b in zip(first.parameters(), second.parameters()):
         assert torch.equal(a, b)
+
+
+def test_another_seed_begins_with_another_gate() -> None:
+    config, lesson = GateConfig(EncodingConfig(octaves=2), 8, 1, 1), ball_lesson(1)
+    first, second = (teach(config, lesson, 1, "float32", seed) for seed in (0, 1))
+    assert not torch.equal(first.head.weight, second.head.weight)
+
+
+def test_the_rate_falls_by_a_half_cosine_to_a_twentieth(monkeypatch: pytest.MonkeyPatch) -> None:
+    rates: list[float] = []
+
+    class Adam(torch.optim.Adam):
+        def step(self, *_: Any) -> None:
+            rates.append(self.param_groups[0]["lr"])
+
+    monkeypatch.setattr(torch.optim, "Adam", Adam)
+    teach(GateConfig(EncodingConfig(octaves=2), 8, 1, 1), ball_lesson(10), 4, "float32")
+    cosines = [1.0, 0.5**0.5, 0.0, -(0.5**0.5)]
+    expected = [0.05 + 0.95 * 0.5 * (1.0 + cosine) for cosine in cosines]
+    assert rates == pytest.approx([0.01 * share for share in expected])
 
 
 def test_rounded_weights_are_held_by_bfloat16() -> None:
