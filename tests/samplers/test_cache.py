@@ -13,7 +13,7 @@ from samplers.analytic_occupancy import Balls, camera_rays
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.samplers.cells.build import build_cache
+from leco_plugin.samplers.cells.build import _check, build_cache
 from leco_plugin.samplers.cells.cache import (
     BRICK,
     COARSE_OCCUPIED,
@@ -58,6 +58,17 @@ def test_the_report_says_what_is_held_and_what_was_measured(cache):
     assert report.checked == 1 << 18
 
 
+@pytest.mark.parametrize("differing", [0, 9])
+def test_the_bound_is_two_deviations_above_what_differs_and_never_nothing(cache, differing):
+    positions = torch.zeros(1000, 3)
+    decided, left_open = cache.decide(positions)
+    assert not left_open.numel()
+    decided[:differing] = ~decided[:differing]
+    report = _check(cache, positions, decided)
+    assert report.differing == differing / 1000
+    assert report.differing_bound == pytest.approx((differing + 2.0 * differing**0.5 + 2.0) / 1000)
+
+
 def test_its_tables_move_with_a_module_and_are_sent_to_nobody(cache):
     host = torch.nn.ModuleDict({"cache": copy.deepcopy(cache)})
     assert not list(host.buffers()) and not host.state_dict()
@@ -86,6 +97,14 @@ def test_positions_outside_a_box_or_nowhere_are_empty(balls, cache):
     if balls.space.kind == "box":
         assert left_open.numel() == 0
     assert cache.near(positions, torch.zeros(3)).shape == (3,)
+
+
+def test_where_a_threshold_of_0_keeps_all_nothing_outside_a_box_is_called_empty():
+    balls = Balls("box")
+    balls.threshold = 0.0
+    cache = build_cache(balls, budget=BUDGET, check_points=1 << 16)
+    positions = torch.tensor([[50.0, 0.0, 0.0], [0.0, -9.0, 0.0], [0.3, -0.2, 0.1]])
+    assert decide(cache, balls, positions).all()
 
 
 def slow_decide(cache: CellCache, space: Space, position: torch.Tensor) -> bool | None:

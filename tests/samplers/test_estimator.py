@@ -327,6 +327,15 @@ def test_an_occupancy_in_double_precision_keeps_what_it_keeps_in_single():
     assert all(map(torch.equal, one, other))
 
 
+def test_rays_that_begin_behind_what_an_occupancy_is_of_are_named_too(caplog):
+    origins, directions = camera_rays(40)
+    for begin, said in ((0.0, 0), (4.0, 1)):
+        caplog.clear()
+        estimator = LearnedOccupancyEstimator(Balls(), cache_bytes=0)
+        estimator.sampling(origins, directions, near_plane=begin, far_plane=8.0)
+        assert len(caplog.records) == said
+
+
 def test_rays_may_be_in_double_precision():
     learned = LearnedOccupancyEstimator(ball(), cache_bytes=BUDGET)
     origins = torch.tensor(CENTRE).double() + torch.tensor([[0.0, 0.0, 4.0]]).double()

@@ -104,6 +104,31 @@ def test_a_coarse_question_changes_the_time_and_not_the_result(uniform):
     assert balls.asked <= asked["near"] * RUN < 0.5 * questions
 
 
+@pytest.mark.parametrize("length", [0.1, 1.0, 10.0])
+def test_a_coarse_question_is_about_a_cube_that_holds_its_run(length):
+    """However long directions are, of which t counts multiples."""
+    origins, directions = camera_rays(50)
+    rays = Rays(origins, length * directions, torch.zeros(50), torch.full((50,), 4.0 / length))
+    asked, cubes = [], []
+
+    def near(positions, radii):
+        cubes.append((positions, radii))
+        return torch.ones(len(positions), dtype=torch.bool)
+
+    def occupied(positions):
+        asked.append(positions)
+        return torch.ones(len(positions), dtype=torch.bool)
+
+    march(rays, March(0.01 / length), occupied, near)
+    (centers, radii), places = cubes[0], asked[0]
+    assert len(places) == RUN * len(centers)
+    # in the coarse question rays are columns, as everywhere in a march
+    runs = centers.view(-1, 50, 3).transpose(0, 1).reshape(-1, 3)
+    wide = radii.view(-1, 50).T.reshape(-1)
+    beyond = (places.view(RUN, -1, 3) - runs).abs().amax(dim=-1) - wide
+    assert -0.01 < float(beyond.max()) <= 1e-5  # the outermost middles are half a step inside
+
+
 def test_bad_rays_have_no_samples_and_good_ones_keep_theirs():
     origins, directions = camera_rays(8)
     t_mins, t_maxs = torch.zeros(8), torch.ones(8)

@@ -171,6 +171,23 @@ def test_what_a_bad_sample_does_to_gradients_stays_on_its_ray(by, bad):
     assert found[4].isnan() or bad == bad
 
 
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
+def test_a_gradient_that_is_no_number_does_not_leave_its_ray(bad):
+    t_starts, t_ends, sigmas = random_samples()
+
+    def gradients(of_fifth: float) -> Tensor:
+        inputs = sigmas.clone().requires_grad_()
+        weights = packed.render_weight_from_density(t_starts, t_ends, inputs, **BY_RAY)[0]
+        given = t_ends.clone()
+        given[4] = of_fifth
+        weights.backward(given)
+        return inputs.grad
+
+    found, clean = gradients(bad), gradients(1.0)
+    torch.testing.assert_close(found[RAYS != 2], clean[RAYS != 2])
+    assert not found[4].isfinite()
+
+
 def test_prefix_transmittance_scales_weights():
     t_starts, t_ends, sigmas = random_samples()
     prefix = torch.rand(10, dtype=torch.float64)
