@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from importlib.metadata import EntryPoint
+
 import nerfacc
 import pytest
 from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
@@ -114,6 +116,16 @@ def test_what_cannot_be_built_is_said_once_and_not_rule_by_rule(spec, said, monk
     monkeypatch.setitem(registry.OURS, "crooked", spec)
     with pytest.raises(ValueError, match=said):
         cases_of("crooked")
+
+
+def test_a_registered_sampler_that_cannot_be_loaded_is_no_unknown_name(monkeypatch):
+    entry = EntryPoint("broken", "no_such_module:SPEC", registry.GROUP)
+    monkeypatch.setattr(registry, "entry_points", lambda group: [entry])
+    with (
+        pytest.warns(UserWarning, match="'broken' is left out"),
+        pytest.raises(ValueError, match="'broken' is registered, but no_such_module:SPEC cannot"),
+    ):
+        cases_of("broken")
 
 
 def test_a_sampler_that_serves_no_seam_is_refused(monkeypatch):

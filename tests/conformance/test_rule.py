@@ -65,6 +65,14 @@ def test_an_error_of_a_library_is_told_where_the_code_that_is_checked_asked_for_
     assert apply(rule(lambda: None), Case()).problem.endswith("given")  # nothing of theirs ran
 
 
+def test_an_error_is_told_where_it_came_up_not_where_that_was_called():
+    def looks_up(case):
+        return {}["t_min"]
+
+    verdict = apply(rule(lambda case: looks_up(case)), Case())
+    assert verdict.problem.endswith(f"(test_rule.py, line {line_of('return {}[')})")
+
+
 def line_of(text: str) -> int:
     lines = Path(__file__).read_text().splitlines()
     return 1 + next(number for number, line in enumerate(lines) if text in line)
