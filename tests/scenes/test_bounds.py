@@ -66,6 +66,17 @@ def test_where_the_lowest_point_lies_is_known_of_a_scene_whose_planes_were_found
     assert find_bounds(*around(), BoundsConfig(space="box")).lowest is None
 
 
+def test_bounds_are_of_all_points_but_one_in_a_thousand_at_either_end() -> None:
+    poses, directions, points = from_above()
+    ends = points.sort(dim=0).values[[round(share * (len(points) - 1)) for share in (0.001, 0.999)]]
+    found = find_bounds(poses, directions, points)
+    relief = float(ends[1, 2] - ends[0, 2])
+    assert float(found.aabb[5]) == pytest.approx(float(ends[1, 2]) + 0.3 * relief, rel=1e-5)
+    inner = find_bounds(poses, directions, points, BoundsConfig(space="contraction"))
+    assert inner.half_extent == pytest.approx(float((ends[1] - ends[0]).max()) / 2, rel=1e-5)
+    torch.testing.assert_close(inner.center, ends.mean(dim=0))
+
+
 def test_marched_samples_of_a_box_lie_in_its_space() -> None:
     poses, directions, points = from_above()
     bounds = find_bounds(poses, directions, points)

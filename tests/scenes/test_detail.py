@@ -9,7 +9,7 @@ from scene_files import refused
 from torch import Tensor
 
 from leco_plugin.scenes.bounds import BoundsConfig
-from leco_plugin.scenes.survey import detail_of
+from leco_plugin.scenes.survey import _pixel_density, covering_rays, detail_of
 
 HEIGHT, SIDE, FOCAL = 2.0, 32, 32.0
 """Of the survey: a pixel's footprint is 1/16, an image's 2 x 2."""
@@ -59,6 +59,13 @@ def test_finer_photographs_show_more() -> None:
     coarse, fine = (detail_of(survey(6.0, size=size), ground(6.0)) for size in (SIDE, 2 * SIDE))
     assert fine.texels == pytest.approx(4.0 * coarse.texels, rel=0.05)
     assert fine.across == pytest.approx(2.0 * coarse.across, rel=0.05)
+
+
+def test_the_footprint_of_a_pixel_is_exact_however_few_an_image_has() -> None:
+    cameras = survey(1.0, size=8)  # with a focal length of 8 pixels, from a height of 2
+    _, directions = covering_rays(cameras)
+    pose = cameras.camera_to_worlds[0]
+    assert float(_pixel_density(torch.zeros(1, 3), pose, directions[0], 8)) == pytest.approx(16.0)
 
 
 def test_of_distances_the_nearest_counts() -> None:
