@@ -40,7 +40,8 @@ STANDS = {
 def readme(text: str) -> str:
     """The README with its tables renewed."""
     text = between(text, DEMO, demo_sentence(json.loads((RESULTS / "demo.json").read_text())))
-    also = f" {without_gifts(stored(GIFTS_CHART))} {after_half_an_hour()} {of_the_papers_host()}"
+    more = without_gifts(stored(GIFTS_CHART)), after_half_an_hour(), of_the_papers_host()
+    also = "".join(f" {part}" for part in more if part)
     text = with_walk(text, ("lines",))
     return between(text, GAIN, gain(also))
 
