@@ -12,7 +12,6 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from leco_plugin.log import counted
 from leco_plugin.scenes.city.city import City
 from leco_plugin.scenes.city.shapes import Array
 
@@ -192,8 +191,8 @@ def views_of(city: City, capture: CaptureConfig) -> list[View]:
     sets = {"aerial": aerial, "street": street}
     names = [f"{kind}_{i:05d}" for kind, poses in sets.items() for i in range(len(poses))]
     if len(names) < 2:
-        few = counted(len(names), "picture is too few", "pictures are too few")
-        raise ValueError(f"{few}: at least one is trained on and one held out")
+        few = "picture is" if len(names) == 1 else "pictures are"
+        raise ValueError(f"{len(names)} {few} too few: at least one is trained on and one held out")
     every = range(len(names))
     held_out = set(every[capture.test_every // 2 :: capture.test_every] or every[-1:])
     return [
