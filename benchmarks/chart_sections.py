@@ -34,22 +34,18 @@ def titles() -> dict[str, str]:
 
 def by_scene(suite: str) -> dict[str, tuple[str, dict[str, Any]]]:
     """Name and results of the stored charts of a suite, by scene."""
+    charts = [(name, stored(name)) for name in titles()]
     return {
         results["scene"]["name"]: (name, results)
-        for name, results in _of_suite(suite)
-        if not _is_longer(results)
+        for name, results in charts
+        if results["suite"] == suite and not _is_longer(results)
     }
 
 
 def longer(suite: str) -> list[tuple[str, dict[str, Any]]]:
     """Title and results of the stored charts whose runs had more time than their suite gives."""
-    named = titles()
-    return [(named[name], each) for name, each in _of_suite(suite) if _is_longer(each)]
-
-
-def _of_suite(suite: str) -> list[tuple[str, dict[str, Any]]]:
-    charts = [(name, stored(name)) for name in titles()]
-    return [(name, results) for name, results in charts if results["suite"] == suite]
+    charts = [(title, stored(name)) for name, title in titles().items()]
+    return [each for each in charts if each[1]["suite"] == suite and _is_longer(each[1])]
 
 
 def _is_longer(results: dict[str, Any]) -> bool:

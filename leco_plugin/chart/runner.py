@@ -125,8 +125,8 @@ def take_folder(
     folder = file.parent
     if file.is_file():
         found = read_object(file, damaged)
-        if (name := _first_other(found, settings)) is not None:
-            said = (words or {}).get(name) or f"{holds} {difference(found, settings)}"
+        if (other := _first_other(found, settings)) is not None:
+            said = (words or {}).get(other[0]) or f"{holds} {_in_words(found, *other)}"
             raise InputError(f"{folder} holds {said}; name a new folder with --out")
     elif folder.exists() and (not folder.is_dir() or set(os.listdir(folder)) - {LOCK}):
         raise InputError(f"{folder} holds something else; name a new folder with --out")
@@ -136,16 +136,18 @@ def take_folder(
 
 def difference(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str | None:
     """The first setting that is not as wanted, in words; None where all are."""
-    if (name := _first_other(found, wanted)) is None:
-        return None
-    value = json.loads(json.dumps(wanted[name]))
-    return f"{name.replace('_', ' ')} ({_short(found.get(name))}, not {_short(value)})"
+    other = _first_other(found, wanted)
+    return None if other is None else _in_words(found, *other)
 
 
-def _first_other(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str | None:
-    """The name of the first setting that is not as wanted; None where all are."""
+def _first_other(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> tuple[str, Any] | None:
+    """Name and wanted value of the first setting that is not as wanted; None where all are."""
     stored = json.loads(json.dumps(wanted))  # tuples as lists
-    return next((name for name, value in stored.items() if found.get(name) != value), None)
+    return next((pair for pair in stored.items() if found.get(pair[0]) != pair[1]), None)
+
+
+def _in_words(found: Mapping[str, Any], name: str, wanted: Any) -> str:
+    return f"{name.replace('_', ' ')} ({_short(found.get(name))}, not {_short(wanted)})"
 
 
 def _short(value: Any) -> str:

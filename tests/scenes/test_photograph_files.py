@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import ClassVar
+from types import SimpleNamespace
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from PIL import Image, ImageOps
 from rendered_survey import odd_exif
 from scene_files import refused
 
+from leco_plugin.scenes import photograph_files
 from leco_plugin.scenes.photograph_files import (
     DerivedImages,
     check_images,
@@ -118,6 +120,16 @@ def test_a_tiff_is_known_as_pillow_decodes_it_which_sets_it_upright(
     assert header.size == ((6, 8) if orientation >= 5 else (8, 6))
     for turn in (True, False):
         np.testing.assert_array_equal(np.asarray(decode(tmp_path / "a.tif", turn)), wanted)
+
+
+@pytest.mark.parametrize(("orientation", "size"), [(3, (8, 6)), (6, (6, 8))])
+def test_a_pillow_that_gives_the_stored_sides_of_a_tiff_is_followed(
+    orientation: int, size: tuple[int, int]
+) -> None:
+    """As Pillow 10.4 does until it decodes."""
+    tags = {0x100: 8, 0x101: 6, 0x112: orientation}
+    image: Any = SimpleNamespace(size=(8, 6), format="TIFF", getexif=lambda: tags)
+    assert photograph_files._size_and_orientation(image) == (size, 1)
 
 
 @pytest.mark.parametrize("mode", ["L", "RGB", "RGBA"])
