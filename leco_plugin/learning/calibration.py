@@ -123,7 +123,7 @@ NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 def added_costs(found: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, float]:
     """What skipping costs on top of what earlier skipping has cost, and standard errors."""
-    known = {name: float(before.get(name, 0.0)) for name in (*LOSSES, *ERRORS)}
+    known = {name: float(before.get(name) or 0.0) for name in (*LOSSES, *ERRORS)}
     costs = {name: max(0.0, found[name]) + max(0.0, known[name]) for name in LOSSES}
     return costs | {name: math.hypot(found[name], known[name]) for name in ERRORS}
 

@@ -15,6 +15,7 @@ from leco_plugin.learning.calibration import (
     THRESHOLDS,
     CalibrationConfig,
     Measured,
+    added_costs,
     backdrop_price,
     calibrate,
     image_price,
@@ -138,6 +139,14 @@ def test_what_was_spent_and_what_is_spent_now_are_held_to_one_bound(
     assert found == measure(rendering, max(fitting, default=0.0))
     assert (found.threshold == 0.0) == (share > 1.0)
     assert found.threshold <= calibrate(rendering, config).threshold
+
+
+def test_a_price_that_nobody_knows_was_not_spent() -> None:
+    """A report of another program may say null for a price."""
+    found = Measured(0.5, 1e-4, 1e-3, 0.02, 0.5, 1e-5, 1e-3)._asdict()
+    known = added_costs(found, {"lost_surface_mass": 2e-4, "image_price_db": None})
+    assert known["lost_surface_mass"] == pytest.approx(3e-4)
+    assert known["image_price_db"] == 0.02
 
 
 def test_what_a_photograph_has_lost_so_far_counts_against_its_bound() -> None:
