@@ -59,7 +59,7 @@ def gate_pictures(met: Shaded, ray_indices: Tensor) -> dict[str, Tensor]:
     return {
         "occupancy": (seen / met.accumulation.clamp(min=MET)[:, None]).where(met_something, 0.0),
         "expert": expert.clamp(min=EMPTY).float(),
-        "samples_per_ray": met.packed_info[:, 1:].float(),
+        "samples_per_ray": met.packed_info[:, 1:].float(),  # nerfstudio cannot show integers
     }
 
 
