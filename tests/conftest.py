@@ -120,7 +120,8 @@ def forks() -> None:
     """
     ours = ["mortal_training", "data_parallel_training"]
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([*ours, "leco_plugin.conformance.cases"])
+    models = ["leco_plugin.hosts.guided", "nerfstudio.models.instant_ngp"]  # what ranks build
+    context.set_forkserver_preload([*ours, "leco_plugin.conformance.cases", *models])
     paths = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", os.pathsep.join(paths))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 from itertools import zip_longest
 from typing import Any
@@ -289,16 +290,22 @@ def _check_kept_is_sampled(
 
     The middles of shifted samples are half a step away, and the ends of a ray may have none.
     """
-    ray_indices, t_starts, t_ends = dense(rays, step=step, unbounded=scene.unbounded)
-    middles = (t_starts + t_ends) / 2.0
-    positions = rays.at(ray_indices, middles)
-    from_ends = torch.minimum(middles - rays.t_min[ray_indices], rays.t_max[ray_indices] - middles)
-    sought = scene.depth(positions) > MARGIN + shifted * step / 2.0
-    sought &= from_ends > shifted * step
-    missing = ~covered(ray_indices[sought], middles[sought], samples)
+    ray_indices, middles = _plainly_kept(rays, scene, step, shifted)
+    missing = ~covered(ray_indices, middles, samples)
     places = f"{int(missing.sum())} of {len(missing)} places"
     said = f"{places} are not sampled although they are occupied"
-    require(not bool(missing.any()), said + _first(positions[sought][missing]))
+    require(not bool(missing.any()), said + _first(rays.at(ray_indices, middles)[missing]))
+
+
+@functools.lru_cache(maxsize=32)
+def _plainly_kept(rays: Rays, scene: Slab, step: float, shifted: bool) -> tuple[Tensor, Tensor]:
+    """Rays and middles of the candidates that `_check_kept_is_sampled` seeks, [N] each."""
+    ray_indices, t_starts, t_ends = dense(rays, step=step, unbounded=scene.unbounded)
+    middles = (t_starts + t_ends) / 2.0
+    from_ends = torch.minimum(middles - rays.t_min[ray_indices], rays.t_max[ray_indices] - middles)
+    sought = scene.depth(rays.at(ray_indices, middles)) > MARGIN + shifted * step / 2.0
+    sought &= from_ends > shifted * step
+    return ray_indices[sought], middles[sought]
 
 
 def _first(positions: Tensor) -> str:

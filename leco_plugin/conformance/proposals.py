@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import torch
@@ -260,6 +261,7 @@ def _check_gathered(
         require(bare == 0, f"{some} no sample in the {half} half of what is kept")
 
 
+@functools.lru_cache(maxsize=32)
 def chords(rays: Rays, scene: Slab = SLAB) -> tuple[Tensor, Tensor]:
     """Where each ray enters and leaves the slab, [n_rays] each, to a hundredth; 0 if never. One
     without end is left at `FAR_AWAY`."""

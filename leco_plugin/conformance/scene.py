@@ -86,6 +86,7 @@ def crossing(n_rays: int = 48) -> Rays:
     return Rays(torch.tensor(CENTRE) + DISTANCE * outward, directions, t_min, t_max)
 
 
+@functools.cache
 def cut_short(n_rays: int = 48) -> Rays:
     """The same rays, which begin and end inside the box."""
     rays = crossing(n_rays)
@@ -93,18 +94,21 @@ def cut_short(n_rays: int = 48) -> Rays:
     return rays._replace(t_min=DISTANCE - 0.8 + spread, t_max=DISTANCE + 0.8 - spread)
 
 
+@functools.cache
 def leaving() -> Rays:
     """The same rays, which go on far beyond the box."""
     rays = crossing()
     return rays._replace(t_max=torch.full_like(rays.t_max, FAR_AWAY))
 
 
+@functools.cache
 def stretched() -> Rays:
     """The rays of `crossing` with directions of length 2, as a host in other units has them."""
     rays = crossing()
     return Rays(rays.origins, 2.0 * rays.directions, rays.t_min / 2.0, rays.t_max / 2.0)
 
 
+@functools.cache
 def without_samples() -> dict[str, Rays]:
     """Rays on which there is nothing to sample, by why."""
     rays = crossing()
@@ -263,10 +267,12 @@ ROUNDING = 1e-4
 """World units that two ways to compute an edge may differ by."""
 
 
+@functools.lru_cache(maxsize=32)
 def dense(
     rays: Rays, cone_angle: float = 0.0, step: float = STEP, unbounded: bool = False
 ) -> Samples:
-    """Every candidate by the one ray-marching rule, in the box or all along the rays."""
+    """Every candidate by the one ray-marching rule, in the box or all along the rays. The same rays
+    are marched once."""
     return DenseEstimator(None if unbounded else box()).sampling(
         rays.origins,
         rays.directions,

@@ -13,6 +13,7 @@ import pytest
 from conformance.mutant_plugin import write_distribution
 
 ROOT = Path(__file__).resolve().parents[2]
+pytestmark = pytest.mark.xdist_group("runs of pytest")  # one process imports nerfstudio for all
 
 
 @pytest.fixture(scope="module")

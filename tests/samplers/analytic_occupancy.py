@@ -62,7 +62,7 @@ def slow_march(
     t_enters: Tensor | None = None,
 ) -> list[tuple[int, float, float]]:
     """(ray, start, end) of each kept candidate, one step at a time in float64."""
-    kept = []
+    found = []
     for ray in range(len(origins)):
         t = t_mins[ray].item()
         finite = origins[ray].isfinite().all() and directions[ray].isfinite().all()
@@ -70,12 +70,15 @@ def slow_march(
             continue
         while t + 0.5 * (dt := max(t * cone_angle, step_size)) < t_maxs[ray].item():
             middle = t + 0.5 * dt
-            late = t_enters is None or middle >= t_enters[ray].item()
-            position = origins[ray] + directions[ray] * middle
-            if late and (occupied is None or bool(occupied(position[None])[0])):
-                kept.append((ray, t, t + dt))
+            if t_enters is None or middle >= t_enters[ray].item():
+                found.append((ray, t, t + dt, middle))
             t += dt
-    return kept
+    kept = [True] * len(found)
+    if occupied is not None and found:
+        rays = torch.tensor([ray for ray, *_ in found])
+        middles = torch.tensor([middle for *_, middle in found], dtype=directions.dtype)
+        kept = occupied(origins[rays] + directions[rays] * middles[:, None]).tolist()
+    return [tuple(one[:3]) for one, keep in zip(found, kept, strict=True) if keep]
 
 
 def slow_weights(

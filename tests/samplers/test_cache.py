@@ -247,10 +247,10 @@ def test_a_gate_that_no_cells_can_hold_is_refused():
     # The decision flips a thousand times across the cube.
     balls.query = lambda positions: (positions[:, 0] * 3000.0).sin() * 0.5 + 0.5
     with pytest.raises(ValueError, match="too rough to be held in cells"):
-        build_cache(balls, check_points=1 << 14)
+        build_cache(balls, budget=BUDGET, check_points=1 << 14)
     # Specks smaller than any cell, which no lattice meets.
     balls.query = lambda positions: ((positions * 997.0).sin().prod(dim=-1) > 0.99).float()
     with pytest.raises(ValueError, match="of the decisions differ"):
-        build_cache(balls, check_points=1 << 18)
+        build_cache(balls, budget=BUDGET, check_points=1 << 16)
     with pytest.raises(ValueError, match="fits 100 bytes"):
         build_cache(Balls(), budget=100, check_points=1 << 14)

@@ -26,6 +26,9 @@ OCTAVES = [1, 6, 12] if INTERPRETED else [1, 4, 6, 8, 10, 12]
 """Of what is padded alike, the interpreter gets one; all other tests have width 32, 4 octaves."""
 
 
+EVERY = 7 if INTERPRETED else 1
+
+
 def fused(asked: Occupancy, places: torch.Tensor) -> torch.Tensor:
     from leco_plugin.samplers.kernels.gate_kernel import gate_decisions
 
@@ -98,7 +101,8 @@ def test_ends_are_ragged(count: int) -> None:
 def test_places_that_no_scene_has(kind: str) -> None:
     asked = occupancy(kind, "float32")
     odd = [0.0, -0.0, 0.1, 1.6, -1.4, 1e6, -1e20, 1e38, 3e38, torch.inf, -torch.inf, torch.nan]
-    places = torch.cartesian_prod(*[torch.tensor(odd, device=DEVICE)] * 3)
+    # every seventh still has all pairs of values on all pairs of axes
+    places = torch.cartesian_prod(*[torch.tensor(odd, device=DEVICE)] * 3)[::EVERY]
     assert torch.equal(fused(asked, places), twin(asked, places))
 
 

@@ -26,7 +26,7 @@ STEP = 1.0 / 16.0
 def estimator(kind: str, precision: str = "float32") -> LearnedOccupancyEstimator:
     asked = occupancy(kind, precision, octaves=2, width=16)
     made = LearnedOccupancyEstimator(asked, cache_bytes=0)
-    made.cache = build_cache(asked, budget=1 << 18, tolerance=1e-2, check_points=1 << 14)
+    made.cache = build_cache(asked, budget=1 << 17, tolerance=1e-2, check_points=1 << 14)
     return made
 
 

@@ -56,6 +56,8 @@ ROUGH = 0.6
 """Share of the probe's cells that the gate's boundary may cross; a rougher gate has no cache."""
 ASKED = 0.003
 """Share of decisions that may be left to the gate; still finer cells are not worth their time."""
+MOST_POINTS = 1 << 20
+"""Decisions that are compared with the gate's, unless the caller says otherwise."""
 BRICKS_AT_ONCE = 128
 
 
@@ -65,7 +67,7 @@ def build_cache(
     *,
     budget: int = 1 << 20,
     tolerance: float = 1e-4,
-    check_points: int = 1 << 20,
+    check_points: int | None = None,
 ) -> CellCache:
     """The finest cache of a frozen occupancy that fits a budget and keeps its decisions.
 
@@ -76,7 +78,8 @@ def build_cache(
         budget: most bytes of its tables.
         tolerance: largest share of decisions that may differ from the gate's, at two standard
             deviations above the measured share.
-        check_points: number of decisions that are compared.
+        check_points: number of decisions that are compared. The default is one for each byte of
+            the budget; at least so many that three may differ, and at most 1,048,576.
 
     Returns:
         The cache, on the occupancy's device, with its report.
@@ -85,6 +88,8 @@ def build_cache(
         ValueError: no cache fits the budget, or none keeps the tolerance (the gate then varies
             within the smallest cells; ask it without a cache).
     """
+    if check_points is None:
+        check_points = _points_to_check(budget, tolerance)
     device = occupancy.space.center.device
     if device.type == "mps":  # lacks some of what judging takes, none of what looking up takes
         cpu = copy.deepcopy(occupancy).to("cpu")  # type: ignore[attr-defined]
@@ -111,6 +116,12 @@ def build_cache(
         f"that fit {budget} bytes: {report.differing:.2g} of the decisions differ, "
         f"{tolerance:g} may"
     )
+
+
+def _points_to_check(budget: int, tolerance: float) -> int:
+    """The default of `check_points`. Smaller tables decide about fewer cells, and need fewer."""
+    fewest = math.ceil(10.0 / max(tolerance, 1e-5))  # of three that differ, the bound is 8.5
+    return min(max(budget, fewest), MOST_POINTS)
 
 
 def _finest_of_use(probe: Tensor) -> float:
