@@ -88,8 +88,8 @@ def test_dispatch_is_three_times_faster_than_the_dense_mixture_for_eight_experts
     teaches: bool,
 ) -> None:
     hmoe = HMoE(HMoEConfig(scene_experts=8, width=256, layers=7, skip=3, residual=False))
-    features, values = torch.randn(4096, 256), torch.rand(4096)
-    routes = torch.randint(9, (4096,))
+    features, values = torch.randn(2048, 256), torch.rand(2048)
+    routes = torch.randint(9, (2048,))
     ours: list[float] = []
     dense: list[float] = []
 
