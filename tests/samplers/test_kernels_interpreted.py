@@ -36,7 +36,7 @@ def test_kernels_agree_with_their_twins() -> None:
     pytest.importorskip("triton")
     files = [str(HERE / f"{name}.py") for name in NAMES]
     said = run(*files, TRITON_INTERPRET="1", OMP_NUM_THREADS="1")
-    assert int(said.splitlines()[-1].split(" passed")[0]) > 40 and "skipped" not in said
+    assert int(said.splitlines()[-1].split(" passed")[0]) > 50 and "skipped" not in said
 
 
 @pytest.mark.parametrize("name", NAMES)
