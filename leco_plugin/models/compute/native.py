@@ -1,8 +1,9 @@
 """Routines in C for a CPU (`hash_grids.c`, `networks.c`, `front_to_back.c`), compiled when first
 wanted.
 
-A C compiler, where there is one, takes less than a second for them. Where there is none, and where
-`LECO_KERNELS_OFF` names `native`, torch does the same work.
+A C compiler, where there is one, takes some four seconds for them, once for a machine (see
+`compiling.py`). Where there is none, and where `LECO_KERNELS_OFF` names `native`, torch does the
+same work.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ import os
 import shlex
 import shutil
 import subprocess
-import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
@@ -24,6 +24,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from leco_plugin.models.compute.compiling import compiled
 from leco_plugin.samplers.kernels import kernels_off
 
 SOURCES = sorted(Path(__file__).parent.glob("*.c"))
@@ -33,8 +34,6 @@ FLAGS = (
 )
 COMPILERS = ("cc", "gcc", "clang")
 """Tried in this order, after the one that the environment variable CC names."""
-SECONDS = 60
-"""That a compiler may take."""
 WIDEST = 512
 """Features of a layer, at most: `networks.c` has room for so many."""
 FEWEST = 2048
@@ -62,17 +61,13 @@ def _library() -> ctypes.CDLL | None:
     if compiler is None:
         _log.info("no C compiler: torch does all the work, some twice as slowly")
         return None
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        made = Path(folder, "native.so")
-        command = [*compiler, *FLAGS, *map(str, SOURCES), "-o", str(made), "-lm"]
-        try:
-            subprocess.run(command, check=True, capture_output=True, timeout=SECONDS)
-            return ctypes.CDLL(str(made))
-        except (OSError, subprocess.SubprocessError) as error:
-            said = getattr(error, "stderr", None) or str(error).encode()
-            why = (said.decode(errors="replace").strip().splitlines() or [type(error).__name__])[0]
-            _log.warning("%s fails: torch does all the work, more slowly: %s", compiler[0], why)
-            return None
+    try:
+        return compiled([*compiler, *FLAGS], SOURCES)
+    except (OSError, subprocess.SubprocessError) as error:
+        said = getattr(error, "stderr", None) or str(error).encode()
+        why = (said.decode(errors="replace").strip().splitlines() or [type(error).__name__])[0]
+        _log.warning("%s fails: torch does all the work, more slowly: %s", compiler[0], why)
+        return None
 
 
 def suits(*tensors: Tensor) -> bool:
