@@ -12,6 +12,9 @@ import os
 import runpy
 import subprocess
 import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
@@ -65,16 +68,42 @@ class ForkedCommands:
 
     def __call__(self, name: str, *arguments: object, status: int = 0) -> str:
         """Runs a command to its end, which must be of this status; returns what it printed."""
+        started = self.start(name, *arguments)
+        found = started.wait()
+        printed = started.log.read_text()
+        assert found == status, f"{name} ended with {found}:\n{printed[-4000:]}"
+        return printed
+
+    def start(self, name: str, *arguments: object) -> Started:
+        """Starts a command, for whose end one waits before the next one."""
         self.count += 1
         log = self.folder / f"{self.count:03d}-{name}.log"
         line = json.dumps({"command": [name, *map(str, arguments)], "log": str(log)})
         stdin = _pipe(self.server.stdin)
         stdin.write(line + "\n")
         stdin.flush()
-        found = int(_pipe(self.server.stdout).readline())
-        printed = log.read_text()
-        assert found == status, f"{name} ended with {found}:\n{printed[-4000:]}"
-        return printed
+        return Started(int(self._answer()), log, lambda: int(self._answer()))
+
+    def _answer(self) -> str:
+        return _pipe(self.server.stdout).readline()
+
+
+@dataclass
+class Started:
+    """A command that is running: its process, what it prints, and a function that waits for its end
+    and returns its status, of a signal a negative one."""
+
+    process: int
+    log: Path
+    wait: Callable[[], int]
+
+    def until(self, seen: Callable[[], bool], seconds: float = 120.0) -> None:
+        """Returns as soon as something is seen; fails if it ends before, or takes so long."""
+        deadline = time.monotonic() + seconds
+        while not seen():
+            ended = not Path(f"/proc/{self.process}").exists()
+            assert not ended and time.monotonic() < deadline, self.log.read_text()[-4000:]
+            time.sleep(0.05)
 
 
 def _pipe(pipe: IO[str] | None) -> IO[str]:
@@ -124,6 +153,7 @@ def _serve() -> None:
         child = os.fork()
         if child == 0:
             sys.exit(_run(**json.loads(line)))  # and what runs at exit, for processes of its own
+        print(child, flush=True)
         _, status = os.waitpid(child, 0)
         print(os.waitstatus_to_exitcode(status), flush=True)
 

@@ -1,24 +1,26 @@
 """The whole way through nerfstudio's own commands: train, resume, evaluate, render, export, view.
 
 They can reach no network and find no LPIPS weights, as on a machine that has just been set up. The
-first and the last one are processes of their own; the others are forks, for each process takes some
-six seconds to import nerfstudio.
+first one is a process of its own; the others are forks, for each process takes some six seconds to
+import nerfstudio.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import re
+import signal
 import socket
 import subprocess
 import sys
-import time
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import telling_viewer
 import torch
 import trimesh
 from bare_machine import variables
@@ -193,37 +195,19 @@ def test_ns_export_writes_a_point_cloud(trained: Path, run: Runner, tmp_path: Pa
     assert np.isfinite(cloud.vertices).all()
 
 
-def test_ns_viewer_loads_the_run_and_answers(
-    trained: Path, environment: dict[str, str], tmp_path: Path
-) -> None:
+def test_ns_viewer_loads_the_run_and_answers(trained: Path, command: ForkedCommands) -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    log = tmp_path / "viewer.log"
-    arguments = ["--load-config", trained / "config.yml", "--viewer.websocket-port", str(port)]
+    arguments = ["--load-config", trained / "config.yml", "--viewer.websocket-port", port]
     direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-    with log.open("w") as output:
-        viewer = subprocess.Popen(
-            [path_of("ns-viewer"), *arguments],
-            env=environment,
-            cwd=tmp_path,
-            stdout=output,
-            stderr=output,
-        )
+    viewer = command.start("python", telling_viewer.__file__, *arguments)
     try:
-        deadline = time.monotonic() + 60
-        while True:
-            assert viewer.poll() is None and time.monotonic() < deadline, log.read_text()[-4000:]
-            try:
-                with direct.open(f"http://127.0.0.1:{port}", timeout=5) as page:
-                    assert page.status == 200
-                break
-            except OSError:
-                time.sleep(0.2)
-        # The page is there before the scene is; a viewer that cannot set it up ends here.
-        time.sleep(1)
-        assert viewer.poll() is None, log.read_text()[-4000:]
-        assert "Done loading checkpoint" in log.read_text()
+        # The page is there before the scene is; a viewer that cannot set it up ends before.
+        viewer.until(lambda: telling_viewer.READY in viewer.log.read_text())
+        with direct.open(f"http://127.0.0.1:{port}", timeout=60) as page:
+            assert page.status == 200
+        assert "Done loading checkpoint" in viewer.log.read_text()
     finally:
-        viewer.terminate()
-        viewer.wait(timeout=20)
+        os.kill(viewer.process, signal.SIGKILL)
+        viewer.wait()

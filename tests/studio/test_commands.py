@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,23 +32,58 @@ import json, os, sys
 import nerfstudio.engine.trainer, nerfstudio.pipelines.base_pipeline  # most of the seconds
 assert "leco_plugin.method_configs" not in sys.modules
 log, programs = sys.argv[1], json.loads(sys.argv[2])
-for number, (program, error) in enumerate(programs):
+for number, (arguments, code) in enumerate(programs):
     child = os.fork()
     if child == 0:
         os.dup2(os.open(f"{log}{number}", os.O_CREAT | os.O_WRONLY), 2)
-        sys.argv = [program]
-        from leco_plugin.scenes.input_error import InputError
-        import leco_plugin.method_configs
-        raise eval(error)
+        sys.argv = arguments
+        exec(code)
+        sys.exit()
     print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 """
-"""Each program of a list ends in an error once it has imported this package."""
+"""Runs each program of a list, as the arguments and the code of a process of Python."""
+RAISE = """
+from leco_plugin.scenes.input_error import InputError
+import leco_plugin.method_configs
+raise {}
+"""
+"""A program that ends in an error once it has imported this package."""
+MODULE = "import runpy; runpy.run_module('nerfstudio.scripts.eval', None, '__main__', True)"
+"""What `python -m nerfstudio.scripts.eval` runs."""
 PROGRAMS = [
     ("ns-train", "InputError('a line')", "a line\n"),
     ("nerfstudio/scripts/train.py", "InputError('a line')", "a line\n"),
     ("ns-train", "ValueError('a line')", "Traceback"),
     ("notebook", "InputError('a line')", "Traceback"),
 ]
+
+
+@dataclass
+class Ended:
+    """Exit statuses of programs, what each printed to stderr, and the config that the last read."""
+
+    statuses: list[str]
+    printed: list[str]
+    config: Path
+
+
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory: pytest.TempPathFactory) -> Ended:
+    """Of `PROGRAMS`, and of a module of nerfstudio that opens a run of another version."""
+    folder = tmp_path_factory.mktemp("ended")
+    config = written(folder, "leco_plugin.models.leco_config.Leco", "leco_plugin.gone.Leco")
+    programs = [([program], RAISE.format(error)) for program, error, _ in PROGRAMS]
+    programs.append((["eval", "--load-config", str(config)], MODULE))
+    command = [sys.executable, "-c", FORKS, f"{folder}/", json.dumps(programs)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    statuses = done.stdout.split()
+    assert len(statuses) == len(programs), done.stderr
+    printed = [(folder / str(number)).read_text() for number in range(len(programs))]
+    return Ended(statuses, printed, config)
+
+
+ONE_PROCESS = pytest.mark.xdist_group("ended")
+"""For tests that share `ended`."""
 
 
 def line_from(call: Any, *arguments: Any) -> str | None:
@@ -83,13 +119,10 @@ def test_programs_of_nerfstudio_are_known(program: str, theirs: bool) -> None:
     assert is_ns_command(program) == theirs
 
 
-def test_a_command_prints_the_line_alone(tmp_path: Path) -> None:
-    programs = json.dumps([program[:2] for program in PROGRAMS])
-    command = [sys.executable, "-c", FORKS, f"{tmp_path}/", programs]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.stdout.split() == ["1"] * len(PROGRAMS), done.stderr
-    for number, (program, _, said) in enumerate(PROGRAMS):
-        printed = (tmp_path / str(number)).read_text()
+@ONE_PROCESS
+def test_a_command_prints_the_line_alone(ended: Ended) -> None:
+    for (program, _, said), status, printed in zip(PROGRAMS, ended.statuses, ended.printed):
+        assert status == "1", printed
         assert printed.endswith(said) if said != "Traceback" else said in printed, program
         assert ("Traceback" in printed) == (said == "Traceback"), program
 
@@ -152,13 +185,13 @@ def test_what_is_missing_elsewhere_keeps_its_traceback(
     assert line_from(eval_setup, written(tmp_path, old, new)) is None
 
 
-def test_a_module_of_nerfstudio_that_is_run_ends_in_the_line_too(tmp_path: Path) -> None:
-    path = written(tmp_path, "leco_plugin.models.leco_config.Leco", "leco_plugin.gone.Leco")
-    command = [sys.executable, "-m", "nerfstudio.scripts.eval", "--load-config", str(path)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    last = done.stderr.strip().splitlines()[-1]
-    assert done.returncode == 1 and last.startswith(f"the run {path} is of another version")
-    assert "Traceback" not in done.stderr
+@ONE_PROCESS
+def test_a_module_of_nerfstudio_that_is_run_ends_in_the_line_too(ended: Ended) -> None:
+    printed = ended.printed[-1]
+    last = printed.strip().splitlines()[-1]
+    said = f"the run {ended.config} is of another version"
+    assert ended.statuses[-1] == "1" and last.startswith(said)
+    assert "Traceback" not in printed
 
 
 def test_only_a_film_needs_ffmpeg(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import copy
 import os
-import subprocess
-import sys
+import signal
 from pathlib import Path
 
 import pytest
+from forked_commands import ForkedCommands
 
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.scenes import locks
@@ -21,9 +21,12 @@ from pathlib import Path
 from leco_plugin.studio.run_folder import claim
 folder = Path(sys.argv[1])
 print(claim(folder, folder / "checkpoints", None), flush=True)
-sys.stdin.read()
 """
-"""Claims a folder, says what came of it, and keeps it until it dies."""
+"""Claims a folder, says what came of it, and ends."""
+KEEP = HOLD + "import signal\nsignal.pause()\n"
+"""The same, and keeps it until it dies."""
+
+IN_FORKS = pytest.mark.xdist_group("commands")
 
 
 @pytest.fixture
@@ -32,30 +35,32 @@ def folder(tmp_path: Path):
     release(tmp_path / "run")
 
 
-def test_a_folder_in_which_a_run_goes_on_is_refused_until_that_run_is_dead(folder: Path) -> None:
-    other = subprocess.Popen(
-        [sys.executable, "-c", HOLD, str(folder)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    with other:
-        assert other.stdout is not None and other.stdout.readline() == "None\n"
+@IN_FORKS
+def test_a_folder_in_which_a_run_goes_on_is_refused_until_that_run_is_dead(
+    command: ForkedCommands, folder: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "keep.py").write_text(KEEP)
+    other = command.start("python", tmp_path / "keep.py", folder)
+    try:
+        other.until(lambda: other.log.read_text().endswith("None\n"))
         assert "another run is going on" in (claim(folder, folder / "checkpoints", None) or "")
-        other.kill()  # SIGKILL: the system lets go of the lock
+    finally:
+        os.kill(other.process, signal.SIGKILL)  # the system lets go of the lock
+        assert other.wait() == -signal.SIGKILL
     assert claim(folder, folder / "checkpoints", None) is None
     assert claim(folder, folder / "checkpoints", None) is None  # this run's already
 
 
+@IN_FORKS
 def test_a_run_that_ends_by_itself_leaves_no_lock_and_one_that_has_it_keeps_it(
-    folder: Path,
+    command: ForkedCommands, folder: Path, tmp_path: Path
 ) -> None:
-    code = HOLD.replace("sys.stdin.read()", "")
-    subprocess.run([sys.executable, "-c", code, str(folder)], check=True, capture_output=True)
+    (tmp_path / "hold.py").write_text(HOLD)
+    assert command("python", tmp_path / "hold.py", folder).endswith("None\n")
     assert list(folder.iterdir()) == []
     assert claim(folder, folder / "checkpoints", None) is None
-    refused = subprocess.run([sys.executable, "-c", code, str(folder)], capture_output=True)
-    assert b"another run is going on" in refused.stdout
+    refused = command("python", tmp_path / "hold.py", folder)
+    assert "another run is going on" in refused
     assert [path.name for path in folder.iterdir()] == [locks.LOCK]
     release(folder)
     assert list(folder.iterdir()) == []
