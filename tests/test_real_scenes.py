@@ -28,8 +28,6 @@ LEAST = 0.3
 """dB that some 20 steps of 128 rays gain on 512 pixels which are the same before and after: of 23
 runs, each with a seed of its own, the least was 0.9 (`banana`, which begins at 18.5 dB)."""
 KINDS = {"brighton_beach": "box", "caliterra": "box", "banana": "box", "fox": "contraction"}
-MORE = ("brighton_beach", "banana")
-"""Boxes as `caliterra`; the test of `leco-occupancy` reads them by default."""
 
 OUTPUTS = {"rgb", "depth", "accumulation", "occupancy", "expert", "samples_per_ray"}
 
@@ -96,9 +94,16 @@ def test_a_scene_trains_freezes_and_renders_without_a_flag(
     assert bool(((values >= 0) & (values <= 1)).all())
 
 
-@pytest.mark.parametrize("sampling", ["coarse-fine", "occupancy-grid"])
+def case_of(name: str, sampling: str) -> Any:
+    """A case of the next test: two run by default, a box and a contraction, each with one sampling.
+    The test of `leco-occupancy` reads the other boxes."""
+    by_default = (name, sampling) in {("caliterra", "occupancy-grid"), ("fox", "coarse-fine")}
+    return pytest.param(name, sampling, marks=[] if by_default else pytest.mark.long)
+
+
 @pytest.mark.parametrize(
-    "name", ["caliterra", "fox", *(pytest.param(n, marks=pytest.mark.long) for n in MORE)]
+    ("name", "sampling"),
+    [case_of(name, sampling) for name in KINDS for sampling in ("coarse-fine", "occupancy-grid")],
 )
 def test_switch_nerf_trains_and_renders_without_a_flag(
     name: str, sampling: str, scenes: Path, tmp_path: Path
