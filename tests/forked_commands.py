@@ -78,14 +78,21 @@ class ForkedCommands:
         """Starts a command, for whose end one waits before the next one."""
         self.count += 1
         log = self.folder / f"{self.count:03d}-{name}.log"
-        line = json.dumps({"command": [name, *map(str, arguments)], "log": str(log)})
+        asked = {"command": [name, *map(str, arguments)], "log": str(log), "number": self.count}
+        line = json.dumps(asked)
         stdin = _pipe(self.server.stdin)
         stdin.write(line + "\n")
         stdin.flush()
-        return Started(int(self._answer()), log, lambda: int(self._answer()))
+        number = self.count
+        return Started(self._answer(number), log, lambda: self._answer(number))
 
-    def _answer(self) -> str:
-        return _pipe(self.server.stdout).readline()
+    def _answer(self, number: int) -> int:
+        """The next answer about the command of this number; what is still said of an earlier one,
+        for whose end a test did not wait, is left out."""
+        while True:
+            about, value = map(int, _pipe(self.server.stdout).readline().split())
+            if about == number:
+                return value
 
 
 @dataclass
@@ -150,12 +157,14 @@ def _serve() -> None:
     importlib.import_module("leco_plugin.swap")
     leave_out_the_cache()
     for line in sys.stdin:
+        asked = json.loads(line)
+        number = asked.pop("number")
         child = os.fork()
         if child == 0:
-            sys.exit(_run(**json.loads(line)))  # and what runs at exit, for processes of its own
-        print(child, flush=True)
+            sys.exit(_run(**asked))  # and what runs at exit, for processes of its own
+        print(number, child, flush=True)
         _, status = os.waitpid(child, 0)
-        print(os.waitstatus_to_exitcode(status), flush=True)
+        print(number, os.waitstatus_to_exitcode(status), flush=True)
 
 
 if __name__ == "__main__":

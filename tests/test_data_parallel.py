@@ -98,6 +98,7 @@ def config_of(method: Any, scene: Path, folder: Path, name: str) -> Any:
     if learning is not model:
         model.occupancy.rays = 64
         model.host.log2_hashmap_size, model.host.max_res, model.host.cone_angle = 8, 32, 1 / 8
+        model.host.grid_resolution, model.host.grid_levels = 16, 2
         made.pipeline.target_num_samples, made.pipeline.max_num_samples_per_ray = 2048, 32
         made.pipeline.fewest_rays = 8
     return made

@@ -15,7 +15,7 @@ from leco_plugin.samplers import estimator
 from leco_plugin.samplers.cells.build import build_cache
 
 SECONDS = 0.3
-STEPS = 30
+STEPS = 24
 """Of each run; the least that an occupancy is learned in is 20."""
 
 
