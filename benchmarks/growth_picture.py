@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +21,8 @@ from leco_plugin.chart.theme import (
     style,
     themed,
 )
-from leco_plugin.scenes.city.city import City, CityConfig
+from leco_plugin.scenes.city.city import CityConfig
+from leco_plugin.scenes.city.plan import choose_blocks
 
 Reports = Mapping[str, Any]
 """Results of `leco capacity`, by the name of their scene."""
@@ -50,11 +50,10 @@ class Grown(NamedTuple):
         return float(self.grid["kept_volume"] / self.gate["kept_volume"])
 
 
-@cache
 def built_area(blocks: int) -> float:
-    """Of the city with so many blocks a side, square metres."""
+    """Of the city with so many blocks a side, square metres. The city itself is not built."""
     config = CityConfig(blocks)
-    return float(City(config).built.sum()) * config.block_size**2
+    return float(choose_blocks(blocks, config.seed).sum()) * config.block_size**2
 
 
 def cities(reports: Reports) -> list[Grown]:
