@@ -8,6 +8,7 @@ import hashlib
 import html
 import json
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -129,12 +130,20 @@ show().catch(error => document.body.prepend("This page needs a newer browser: " 
 
 def write_page_file(figure: Any, path: Path, title: str) -> Path:
     """Writes a figure of plotly as a page: 2 MB for the library, which take 5 MB as they are."""
-    from plotly.offline import get_plotlyjs
-
-    def packed(text: str) -> str:
-        return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()
-
-    parts = {"library": packed(get_plotlyjs()), "shown": packed(figure.to_json())}
+    parts = {"library": _library(), "shown": _pack(figure.to_json())}
     page = PAGE.format(title=html.escape(title), **parts).encode()
     write_whole(path, lambda file: file.write(page))
     return path
+
+
+@cache
+def _library() -> str:
+    """The library of plotly, packed; once a process, as that takes half a second."""
+    from plotly.offline import get_plotlyjs
+
+    return _pack(get_plotlyjs())
+
+
+def _pack(text: str) -> str:
+    """A text as base64 of its gzip, which the page unpacks."""
+    return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()

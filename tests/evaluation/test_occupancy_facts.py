@@ -8,12 +8,19 @@ import pytest
 import torch
 from torch import Tensor
 
+from leco_plugin.evaluation import equal_loss
 from leco_plugin.evaluation.equal_loss import compare_with_truth, free_points
 from leco_plugin.scenes.city.city import CityConfig
 from leco_plugin.scenes.city.folder import CaptureConfig, CityTruth, write_city
 
 SCALE, STEP, HIGHEST = 0.02, 0.01, 1.2
 NO_WALLS = torch.tensor([-1e6] * 3 + [1e6] * 3)
+
+
+@pytest.fixture(autouse=True)
+def few_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(equal_loss, "AIR_POINTS", 4000)
+    monkeypatch.setattr(equal_loss, "MOST_SURFACE_POINTS", 4000)
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ from scene_files import refused
 from leco_plugin.scenes.city.folder import CityTruth
 from leco_plugin.scenes.city_dataparser import LecoCityDataParserConfig, leco_city_dataparser
 from leco_plugin.scenes.frames import METRES_PER_UNIT, POINTS
+from leco_plugin.scenes.mega_nerf import mega_nerf_dataparser
 
 
 @pytest.fixture(scope="module")
@@ -92,18 +93,25 @@ def test_points_below_the_visible_ground_are_matter(truth: CityTruth) -> None:
     assert truth.occupied(ground - down).all()
 
 
-def test_the_entry_point_is_light_to_import() -> None:
-    """Every ns-* command imports it: nothing that draws or builds may come along."""
+def test_the_entry_points_are_light_to_import() -> None:
+    """Every ns-* command imports this one and that of Mega-NeRF: nothing that reads, draws or
+    builds may come along."""
     code = (
-        "import sys, leco_plugin.scenes.city_dataparser;"
-        "print(*(m for m in sys.modules if m.startswith('leco_plugin.scenes.') or m == 'trimesh'))"
+        "import sys; of = lambda: {m for m in sys.modules if m[:12] == 'leco_plugin.'};"
+        "import leco_plugin.scenes.mega_nerf; first = of();"
+        "print(*first, 'trimesh' in sys.modules);"
+        "import leco_plugin.scenes.city_dataparser; print(*of() - first, 'trimesh' in sys.modules)"
     )
     loaded = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True
     )
-    light = {"leco_plugin.scenes.city_dataparser", "leco_plugin.scenes.input_error"}
-    assert set(loaded.stdout.split()) == light
+    mega_nerf, city = map(str.split, loaded.stdout.splitlines())
+    scenes = "leco_plugin.scenes"
+    assert set(mega_nerf) == {scenes, f"{scenes}.mega_nerf", "False"}
+    light = {f"{scenes}.city_dataparser", f"{scenes}.input_error", "False"}
+    assert {name for name in city if name.startswith(scenes) or "." not in name} == light
     assert isinstance(leco_city_dataparser, DataParserSpecification)
+    assert isinstance(mega_nerf_dataparser, DataParserSpecification)
 
 
 @pytest.mark.parametrize(

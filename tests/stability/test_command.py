@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from stability_runs import Runs
+from stability_runs import TINY, Runs
 
 from leco_plugin import cli
 from leco_plugin.scenes.locks import alone_in
@@ -35,8 +36,13 @@ def test_all_was_run_is_success_whatever_the_verdicts_are(tmp_path: Path, runs: 
 
 @pytest.mark.parametrize("psnr", [25.0, 24.5, 20.0])
 def test_a_suite_that_is_blind_says_so(
-    tmp_path: Path, runs: Runs, capsys: pytest.CaptureFixture[str], psnr: float
+    tmp_path: Path,
+    runs: Runs,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    psnr: float,
 ) -> None:
+    monkeypatch.setattr(suite, "FULL", replace(suite.FULL, picture=TINY.picture, views=TINY.views))
     runs.psnrs = {"learned": psnr}
     words = ["stability", "--out", str(tmp_path / "out"), "--cases", "homogeneous"]
     assert cli.main(words) == (0 if psnr == 20.0 else 1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -33,7 +34,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def copy(folder: Path, tmp_path: Path) -> Path:
     """A folder that a test may damage."""
-    return write_city(CITY, tmp_path / "city", CAPTURE, progress=False)
+    return Path(shutil.copytree(folder, tmp_path / "city"))
+
+
+@pytest.fixture(scope="module")
+def mega_nerf(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same city in Mega-NeRF's format."""
+    place = tmp_path_factory.mktemp("scenes") / "city"
+    return write_city(CITY, place, CAPTURE, progress=False, layout="mega-nerf")
 
 
 def test_the_city_is_rebuilt_from_its_folder(folder: Path) -> None:
@@ -125,19 +133,37 @@ def until_killed(self, *arguments):
 Tracer.photograph = until_killed
 capture = CaptureConfig(40, 30, aerial_per_block=6, street_per_block=3, test_every=3)
 config = CityConfig(blocks=1, seed=3, sky=True)
-write_city(config, sys.argv[1] + "/city", capture, False, sys.argv[2])
+for layout in sys.argv[2:]:
+    os.mkdir(sys.argv[1] + "/" + layout)
+    if (child := os.fork()) == 0:
+        sys.argv[1] += "/" + layout
+        write_city(config, sys.argv[1] + "/city", capture, False, layout)
+        os._exit(0)
+    print(os.WTERMSIG(os.waitpid(child, 0)[1]))
 """
+LAYOUTS: tuple[LayoutName, ...] = ("nerfstudio", "mega-nerf")
 
 
-@pytest.mark.parametrize("layout", ["nerfstudio", "mega-nerf"])
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with one of each layout, in which a run was killed while it wrote a city.
+
+    One process imports what they need, and each run is a fork of it.
+    """
+    folder = tmp_path_factory.mktemp("killed")
+    command = [sys.executable, "-W", "ignore", "-c", KILLED, str(folder), *LAYOUTS]
+    done = subprocess.run(command, timeout=200, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [str(int(signal.SIGKILL))] * len(LAYOUTS)
+    return folder
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
 def test_a_killed_run_is_taken_up_where_it_ended(
-    layout: LayoutName, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    layout: LayoutName, killed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    killed = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", KILLED, str(tmp_path), layout], timeout=200
-    )
-    assert killed.returncode == -signal.SIGKILL
-    assert not (tmp_path / "city").exists()
+    folder = killed / layout
+    assert not (folder / "city").exists()
+    assert [path.name for path in folder.iterdir() if path.name.startswith(".")] != []
     taken = []
     photograph = Tracer.photograph
 
@@ -146,10 +172,10 @@ def test_a_killed_run_is_taken_up_where_it_ended(
         return photograph(self, *arguments)
 
     monkeypatch.setattr(Tracer, "photograph", count)
-    resumed = write_city(CITY, tmp_path / "city", CAPTURE, progress=False, layout=layout)
+    resumed = write_city(CITY, folder / "city", CAPTURE, progress=False, layout=layout)
     assert len(taken) == 9 - 3
-    whole = write_city(CITY, tmp_path / "other", CAPTURE, progress=False, layout=layout)
-    assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
+    whole = write_city(CITY, folder / "other", CAPTURE, progress=False, layout=layout)
+    assert [path.name for path in folder.iterdir() if path.name.startswith(".")] == []
     assert contents(resumed) == contents(whole)
 
 
@@ -209,8 +235,10 @@ def test_a_city_in_another_format_is_refused(folder: Path) -> None:
 @pytest.mark.parametrize(
     "lost", ["mappings.txt", "train/rgbs/000000.png", "val/metadata/000001.pt"]
 )
-def test_a_damaged_city_in_mega_nerfs_format_is_named(lost: str, tmp_path: Path) -> None:
-    folder = write_city(CITY, tmp_path / "city", CAPTURE, progress=False, layout="mega-nerf")
+def test_a_damaged_city_in_mega_nerfs_format_is_named(
+    lost: str, mega_nerf: Path, tmp_path: Path
+) -> None:
+    folder = Path(shutil.copytree(mega_nerf, tmp_path / "city"))
     assert count_pictures(folder) == (9, 3)
     (folder / lost).unlink()
     with pytest.raises(ValueError, match=f"is damaged: .*{Path(lost).name} is missing"):
