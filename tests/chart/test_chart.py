@@ -89,9 +89,7 @@ def test_stopping_ends_the_runs_beside_and_none_of_them_is_a_failure(
     assert not made.folder.failures() and len(made.missing()) == 6
 
 
-@pytest.mark.parametrize(
-    "stops_at", [0, *(pytest.param(i, marks=pytest.mark.long) for i in (1, 2, 4)), 3, 5]
-)
+@pytest.mark.parametrize("stops_at", range(6))
 def test_after_a_kill_only_what_is_missing_is_made(
     tiny_scene: Path, tmp_path: Path, stops_at: int
 ) -> None:

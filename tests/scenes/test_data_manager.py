@@ -235,15 +235,8 @@ def test_a_fisheye_is_read_as_far_as_its_lens_shows(
         assert 7.0 < float(distances.max()) <= 10.0
 
 
-@pytest.mark.parametrize(
-    ("kept", "sizes"),
-    [
-        ("memory", "one size"),
-        ("memory", "two sizes"),
-        ("disk", "two sizes"),
-        pytest.param("disk", "one size", marks=pytest.mark.long),
-    ],
-)
+@pytest.mark.parametrize("kept", ["memory", "disk"])
+@pytest.mark.parametrize("sizes", ["one size", "two sizes"])
 def test_beside_fisheyes_perspective_photographs_are_read_as_a_whole(
     kept: Any, sizes: str, scene: Path, tmp_path: Path
 ) -> None:

@@ -81,15 +81,15 @@ def test_points_lie_where_mapping_finds_them_and_nothing_else_changes(
     assert "has" in (said := capsys.readouterr().out) and "nothing is done" in said
 
 
-def test_what_masks_or_opacity_hide_gets_no_points(few: Path) -> None:
-    """The left third of each photograph is hidden, in every other one by its opacity; no point is
-    there in all that see it."""
+@pytest.mark.parametrize("hidden_by", ["masks", "opacity"])
+def test_what_is_hidden_gets_no_points(few: Path, hidden_by: str) -> None:
+    """The left third of each photograph is hidden; no point is there in all that see it."""
     bare, meta = few, json.loads((few / "transforms.json").read_text())
     for number, frame in enumerate(meta["frames"]):
         with Image.open(bare / frame["file_path"]) as image:
             shown = Image.new("L", image.size, 255)
             shown.paste(0, (0, 0, image.width // 3, image.height))
-            if number % 2:
+            if hidden_by == "masks":
                 frame["mask_path"] = f"{number}.png"
                 shown.save(bare / frame["mask_path"])
             else:
