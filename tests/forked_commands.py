@@ -154,9 +154,7 @@ def _run(command: list[str], log: str) -> int:
 def _end(status: int) -> None:
     """Ends this process as Python does, after its threads and what runs at exit; but what it has
     imported is not taken down piece by piece, which takes longer than most commands."""
-    for thread in threading.enumerate():
-        if not thread.daemon and thread is not threading.main_thread():
-            thread.join()
+    threading._shutdown()
     atexit._run_exitfuncs()
     sys.stdout.flush()
     sys.stderr.flush()

@@ -15,6 +15,7 @@ from leco_plugin.conformance.samplers import (
     SamplerCase,
     check_gradients,
     check_module,
+    check_rays,
     check_shifts,
     check_tensor,
     devices,
@@ -71,8 +72,11 @@ class EstimatorCase(SamplerCase):
     def sample(
         self, sampler: Any, rays: Rays, scene: Slab = SLAB, *, seed: int = 0, **options: Any
     ) -> Samples:
-        """ray_indices, t_starts, t_ends, as `sampling` returns them."""
         torch.manual_seed(seed)
+        return self.ask(sampler, rays.copied(), **options)
+
+    def ask(self, sampler: Any, rays: Rays, **options: Any) -> Samples:
+        """ray_indices, t_starts, t_ends, as `sampling` returns them."""
         samples = sampler.sampling(
             rays_o=rays.origins,
             rays_d=rays.directions,
@@ -127,7 +131,9 @@ def shapes_types_devices(case: EstimatorCase) -> None:
     for device in devices():
         sampler, rays = case.shared(SLAB).to(device), crossing().to(device)
         for training in (False, True):
-            samples = case.sample(sampler.train(training), rays)
+            given = rays.copied()
+            samples = case.ask(sampler.train(training), given)
+            check_rays(given, rays)
             shapes = [list(part.shape) for part in samples]
             require(
                 len(shapes[0]) == 1 and shapes[0] == shapes[1] == shapes[2] and shapes[0][0] > 0,

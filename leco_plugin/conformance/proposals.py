@@ -13,6 +13,7 @@ from leco_plugin.conformance.samplers import (
     SamplerCase,
     check_gradients,
     check_module,
+    check_rays,
     check_shifts,
     check_tensor,
     devices,
@@ -69,7 +70,11 @@ class ProposalCase(SamplerCase):
     ) -> tuple[Any, Any, Any]:
         """ray_samples, weights_list and ray_samples_list, as a host gets them whose density_fns are
         of this density, or that of the scene."""
-        answer = sampler(ray_bundle(rays), density_fns=[density or scene.density] * LEVELS)
+        return self.ask(sampler, ray_bundle(rays.copied()), density or scene.density)
+
+    def ask(self, sampler: Any, rays: Any, density: Any = SLAB.density) -> tuple[Any, Any, Any]:
+        """The same of a bundle of rays."""
+        answer = sampler(rays, density_fns=[density] * LEVELS)
         require(
             isinstance(answer, (tuple, list)) and len(answer) == 3,
             f"the call returned {type(answer).__name__} instead of ray_samples, weights_list and "
@@ -154,7 +159,9 @@ def shapes_types_devices(case: ProposalCase) -> None:
     """As many samples on each ray; weights for the samples of each level that the host has."""
     for device in devices():
         sampler, rays = case.shared(SLAB).to(device), crossing().to(device)
-        ray_samples, weights, candidates = case.answer(sampler, rays)
+        given = rays.copied()
+        ray_samples, weights, candidates = case.ask(sampler, ray_bundle(given))
+        check_rays(given, rays)
         require(
             len(weights) == len(candidates) == LEVELS,
             f"{LEVELS} density_fns got {len(weights)} weights and {len(candidates)} samples",

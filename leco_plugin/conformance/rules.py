@@ -166,9 +166,11 @@ RULES = (
     ),
     Rule(
         "shapes-types-devices",
-        "a host indexes its rays with what it gets, and multiplies it with its densities.",
+        "a host indexes its rays with what it gets, multiplies it with its densities, and goes on "
+        "using its rays.",
         "make every tensor from those of the rays (new_zeros, to), never with a device or "
-        "type of its own; one length for all packed tensors, one number of samples for all rays; "
+        "type of its own; write nothing into the rays; one length for all packed tensors, one "
+        "number of samples for all rays; "
         "make ray_samples by ray_bundle.get_ray_samples, so that deltas are ends - starts and "
         "camera_indices, times and metadata are those of the rays (proposal).",
     ),

@@ -119,6 +119,12 @@ def check_tensor(name: str, tensor: Tensor, rays: Tensor) -> None:
     require(bool(tensor.isfinite().all()), f"{name} holds values that are not finite")
 
 
+def check_rays(given: Rays, before: Rays) -> None:
+    """Raises if a sampler has written into the rays that it was given."""
+    for name, now, was in zip(Rays._fields, given, before, strict=True):
+        require(torch.equal(now, was), f"{name} of the host's rays was written into")
+
+
 def check_gradients(field: Field, why: str) -> None:
     """Raises unless all parameters of a field have finite gradients."""
     gradients = [parameter.grad for parameter in field.parameters()]

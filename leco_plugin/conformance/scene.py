@@ -73,6 +73,11 @@ class Rays(NamedTuple):
         """The same on another device."""
         return Rays(*(tensor.to(device) for tensor in self))
 
+    def copied(self) -> Rays:
+        """The same in tensors of their own. What is kept is never handed to a sampler, which may
+        write into it."""
+        return Rays(*(tensor.clone() for tensor in self))
+
 
 @functools.cache
 def crossing(n_rays: int = 48) -> Rays:

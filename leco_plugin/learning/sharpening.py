@@ -175,9 +175,7 @@ class Sharpened(NamedTuple):
     def line(self) -> str:
         """What it does, in the words of the log."""
         end = "" if self.pays else "; that is no more, and the gate stays"
-        return (
-            f"{self.measured.line} more, where {self.before.empty_fraction:.1%} were skipped{end}"
-        )
+        return f"{self.measured.line}, where {self.before.empty_fraction:.1%} were skipped{end}"
 
     def report(self, before: dict[str, Any], learned: GateConfig) -> dict[str, Any]:
         """The report of an occupancy of this gate.

@@ -86,6 +86,16 @@ class DoubleStarts(Answers):
         return ray_indices, t_starts.double(), t_ends
 
 
+class WritesIntoRays(Sound):
+    """Which a host goes on using, to place its backdrop for instance."""
+
+    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
+        samples = super().sampling(rays_o, rays_d, *args, **options)
+        if options.get("t_max") is not None:
+            options["t_max"].mul_(0.5)
+        return samples
+
+
 class FarFirst(Answers):
     def change(self, ray_indices: Tensor, t_starts: Tensor, t_ends: Tensor) -> Samples:
         order = (ray_indices * 1e3 - t_starts).argsort()
@@ -309,7 +319,7 @@ DeafToDensities = deaf_to("DeafToDensities", sigma_fn=None, alpha_fn=None)
 
 MUTANTS: dict[str, tuple[type, ...]] = {
     "signature": (RaysInAnotherOrder, AnotherDefault, NoTorchModule),
-    "shapes-types-devices": (DoubleStarts,),
+    "shapes-types-devices": (DoubleStarts, WritesIntoRays),
     "sorted-disjoint-inside": (
         FarFirst,
         Overlapping,

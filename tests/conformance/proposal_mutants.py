@@ -47,6 +47,15 @@ class OneLevelOnly(SoundProposal):
         return super().generate_ray_samples(ray_bundle, None)
 
 
+class WritesIntoBundles(SoundProposal):
+    """Which a host goes on using, to place its backdrop for instance."""
+
+    def generate_ray_samples(self, ray_bundle: Any = None, density_fns: Any = None) -> Any:
+        answer = super().generate_ray_samples(ray_bundle, density_fns)
+        ray_bundle.fars.mul_(0.5)
+        return answer
+
+
 class FlatWeights(SoundProposal):
     def generate_ray_samples(self, ray_bundle: Any = None, density_fns: Any = None) -> Any:
         samples, weights, candidates = super().generate_ray_samples(ray_bundle, density_fns)
@@ -243,6 +252,7 @@ PROPOSAL_MUTANTS: dict[str, tuple[type, ...]] = {
     "signature": (NoCallbacks, TuplesForLists, AsksProposalNetworks),
     "shapes-types-devices": (
         OneLevelOnly,
+        WritesIntoBundles,
         FlatWeights,
         TwiceAsLong,
         WithoutLength,

@@ -58,7 +58,7 @@ def failing(name: str, rules: tuple[Rule, ...]) -> dict[str, str]:
     return {verdict.rule.name: verdict.problem for verdict in verdicts if not verdict.passed}
 
 
-@pytest.mark.parametrize("name", ["Sound", "SoundProposal", *SOUND])
+@pytest.mark.parametrize("name", ["Sound", "SoundProposal", *SOUND, "Unguided"])
 def test_what_mutants_are_made_of_keeps_all_rules(name: str) -> None:
     assert failing(name, IN_THIS_PROCESS) == {}
 

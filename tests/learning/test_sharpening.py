@@ -22,6 +22,7 @@ from leco_plugin.learning.sharpening import (
     lesson_by,
     seen_reference,
     sharpen,
+    teach,
 )
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
@@ -295,6 +296,14 @@ def test_without_a_position_to_teach_with_nothing_is_sharpened(
     options = SharpeningConfig(steps=5, least_steps=10, rays=50, gate=GATE)
     end_a_run(mixture, options)
     assert mixture.small is None
+
+
+def test_the_same_lesson_teaches_the_same_gate_whatever_was_drawn_before() -> None:
+    lesson = Lesson(2.0 * torch.rand(500, 3) - 1.0, torch.rand(500), torch.rand(500))
+    one, other = (teach(GATE, lesson, 20, "float32", seed) for seed in (3, 3))
+    third = teach(GATE, lesson, 20, "float32", 4)
+    assert all(map(torch.equal, one.parameters(), other.parameters()))
+    assert not all(map(torch.equal, one.parameters(), third.parameters()))
 
 
 def test_what_does_not_pay_changes_nothing() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import importlib
 import inspect
 import re
 import warnings
@@ -197,6 +198,20 @@ def test_entry_points_of_other_packages_are_found_and_broken_ones_left_out(monke
             build_estimator("broken", aabb=BOX)
         with pytest.raises(ValueError, match="of type function, where a SamplerSpec is expected"):
             build_estimator("builder", aabb=BOX)
+
+
+def test_a_package_that_is_installed_while_the_process_runs_is_found(tmp_path, monkeypatch):
+    """As in a notebook."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(registry, "FOREIGN", FOREIGN, raising=False)
+    assert "late" not in samplers()
+    installed = tmp_path / "late-1.0.dist-info"
+    installed.mkdir()
+    (installed / "METADATA").write_text("Metadata-Version: 2.1\nName: late\nVersion: 1.0\n")
+    entry = f"[{registry.GROUP}]\nlate = leco_plugin.samplers.registry:FOREIGN\n"
+    (installed / "entry_points.txt").write_text(entry)
+    importlib.invalidate_caches()
+    assert samplers()["late"] is FOREIGN
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 The file is `leco_plugin/native-DIGEST.so` in `$XDG_CACHE_HOME`, or else in `~/.cache`. The digest
 is of the sources, the command, the compiler and the processor. A change of one of them makes
-another file.
+another file. It may be deleted at any time.
 """
 
 from __future__ import annotations
@@ -13,10 +13,12 @@ import hashlib
 import os
 import platform
 import shutil
+import stat
 import subprocess
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import BinaryIO
 
 from leco_plugin.scenes.whole_files import write_whole
 
@@ -39,18 +41,15 @@ def compiled(command: Sequence[str], sources: Sequence[Path]) -> ctypes.CDLL:
     """
     folder = cache_folder()
     kept = folder / f"native-{digest(command, sources)}.so" if folder else None
-    if kept is not None and _is_own(kept):
-        with contextlib.suppress(OSError):  # damaged: it is compiled again
-            return ctypes.CDLL(str(kept))
+    library = _load(kept)
+    if library is not None:
+        return library
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as temporary:
         made = Path(temporary, "native.so")
         whole = [*command, *map(str, sources), "-o", str(made), "-lm"]
         subprocess.run(whole, check=True, capture_output=True, timeout=SECONDS)
-        library = ctypes.CDLL(str(made))
-        if kept is not None:
-            with contextlib.suppress(OSError):  # the next process compiles it again
-                write_whole(kept, lambda file: file.write(made.read_bytes()))
-        return library
+        _keep(kept, made.read_bytes())
+        return _load(kept) or ctypes.CDLL(str(made))
 
 
 def cache_folder() -> Path | None:
@@ -59,20 +58,48 @@ def cache_folder() -> Path | None:
     return folder / "leco_plugin" if folder.is_absolute() else None
 
 
-def _is_own(path: Path) -> bool:
-    """Whether this user has written a file: another user's is not run."""
+def _keep(path: Path | None, library: bytes) -> None:
+    """Writes a library with its digest at the end, which loaders do not read. Where that cannot be,
+    the next process compiles it again."""
+
+    def write(file: BinaryIO) -> None:
+        os.fchmod(file.fileno(), 0o600)
+        file.write(library + hashlib.sha256(library).digest())
+
+    if path is not None:
+        with contextlib.suppress(OSError):
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            write_whole(path, write)
+
+
+def _load(path: Path | None) -> ctypes.CDLL | None:
+    """A library that `_keep` wrote; None where it is missing, damaged, or another user's work.
+
+    Loading one that is cut short would end the process, without a word.
+    """
     try:
-        return path.stat().st_uid == os.getuid()
+        if path is None or not (
+            _is_own(path.parent.stat()) and _is_own(path.lstat(), stat.S_IFREG)
+        ):
+            return None
+        content = path.read_bytes()
+        whole = hashlib.sha256(content[:-32]).digest() == content[-32:]
+        return ctypes.CDLL(str(path)) if whole else None
     except OSError:
-        return False
+        return None
+
+
+def _is_own(found: os.stat_result, kind: int = stat.S_IFDIR) -> bool:
+    """Whether only this user can have written a file or folder, which is of this kind."""
+    writable = found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    return found.st_uid == os.geteuid() and not writable and stat.S_IFMT(found.st_mode) == kind
 
 
 def digest(command: Sequence[str], sources: Sequence[Path]) -> str:
     """Sixteen hexadecimal digits of all that the library depends on."""
-    compiler = Path(shutil.which(command[0]) or command[0]).resolve()
-    known = compiler.stat() if compiler.exists() else None
-    version = (known.st_size, known.st_mtime_ns) if known else None
-    sha = hashlib.sha256(repr((list(command), str(compiler), version, processor())).encode())
+    programs = [Path(found).resolve() for word in command if (found := shutil.which(word))]
+    versions = [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in programs]
+    sha = hashlib.sha256(repr((list(command), versions, processor())).encode())
     for source in sources:
         headers = sorted(source.parent.glob("*.h"))
         for path in (source, *headers):
@@ -81,9 +108,10 @@ def digest(command: Sequence[str], sources: Sequence[Path]) -> str:
 
 
 def processor() -> list[str]:
-    """What is known of this machine's processor."""
-    known = [platform.system(), platform.machine(), platform.processor()]
-    with contextlib.suppress(OSError):
+    """What is known of this machine's processor; where that is nothing, the machine's name."""
+    try:
         first = Path("/proc/cpuinfo").read_text().partition("\n\n")[0]
-        known += [line for line in first.splitlines() if line.startswith(OF_A_PROCESSOR)]
-    return known
+        known = [line for line in first.splitlines() if line.startswith(OF_A_PROCESSOR)]
+    except OSError:
+        known = []
+    return [platform.system(), platform.machine(), *(known or [platform.node()])]

@@ -1,5 +1,4 @@
-"""Routines in C for a CPU (`hash_grids.c`, `networks.c`, `front_to_back.c`), compiled when first
-wanted.
+"""Routines in C for a CPU (the `.c` files beside this one), compiled when first wanted.
 
 A C compiler, where there is one, takes some four seconds for them, once for a machine (see
 `compiling.py`). Where there is none, and where `LECO_KERNELS_OFF` names `native`, torch does the

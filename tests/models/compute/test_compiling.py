@@ -88,18 +88,32 @@ def test_it_is_compiled_anew_by_a_compiler_that_has_been_updated(
 def test_a_damaged_library_is_made_anew(compiler: Compiler, tmp_path: Path) -> None:
     compiler()
     (file,) = kept(tmp_path)
-    file.unlink()  # what is loaded keeps the old one
-    file.write_bytes(b"no library")
-    assert compiler() == 3 and compiler.started == 2
-    assert kept(tmp_path) == [file] and file.stat().st_size > 1000
+    whole = file.read_bytes()
+    for count, damaged in enumerate((b"", b"no library", whole[: len(whole) // 2], whole[:-1])):
+        file.unlink()  # what is loaded keeps the old one
+        file.write_bytes(damaged)
+        file.chmod(0o600)
+        assert compiler() == 3 and compiler.started == 2 + count
+        assert kept(tmp_path) == [file] and len(file.read_bytes()) == len(whole)
 
 
-def test_the_library_of_another_user_is_not_loaded(
-    compiler: Compiler, monkeypatch: pytest.MonkeyPatch
+def test_a_library_that_another_user_may_have_written_is_not_loaded(
+    compiler: Compiler, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     compiler()
-    monkeypatch.setattr(compiling.os, "getuid", lambda: -1)
+    (file,) = kept(tmp_path)
+    assert file.stat().st_mode & 0o777 == 0o600 and file.parent.stat().st_mode & 0o777 == 0o700
+    file.chmod(0o620)
     assert compiler() == 3 and compiler.started == 2
+    file.unlink()
+    file.symlink_to(tmp_path / "elsewhere.so")
+    assert compiler() == 3 and compiler.started == 3 and not file.is_symlink()
+    file.parent.chmod(0o777)
+    assert compiler() == 3 and compiler.started == 4
+    file.parent.chmod(0o700)
+    assert compiler() == 3 and compiler.started == 4
+    monkeypatch.setattr(compiling.os, "geteuid", lambda: -1)
+    assert compiler() == 3 and compiler.started == 5
 
 
 def test_without_a_folder_to_keep_it_each_process_compiles_it(
