@@ -44,6 +44,7 @@ docs: $(READY)
 	@echo "open site/index.html"
 
 env: $(READY)
+	@echo "ready; now type: source $(BIN)/activate"
 
 # The wheel is built from the sdist, then installed and tried in an environment of its own.
 dist: $(READY)
