@@ -21,7 +21,7 @@ STEPS = 24
 
 def small_cache(occupancy: Any, budget: int, **options: Any) -> Any:
     """A cell cache as users have, which is built in a sixteenth of the time."""
-    return build_cache(occupancy, budget=1 << 16, **{**options, "check_points": 1 << 16})
+    return build_cache(occupancy, budget=1 << 16, **options)
 
 
 if __name__ == "__main__":

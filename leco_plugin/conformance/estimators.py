@@ -217,9 +217,10 @@ def _check_uniform(shares: Tensor) -> None:
     By the statistic of Kolmogorov and Smirnov, which for these exceeds 4 / sqrt(N) once in 10^13,
     and the correlation of neighbours, which exceeds 6 / sqrt(N) once in 10^8.
     """
+    from scipy.stats import ks_1samp, uniform
+
     n = len(shares)
-    found, even = shares.cpu().double().sort().values, torch.arange(n + 1, dtype=torch.float64) / n
-    apart = float(torch.maximum(even[1:] - found, found - even[:-1]).max())
+    apart = float(ks_1samp(shares.cpu().numpy(), uniform.cdf, method="asymp").statistic)
     bound = 4.0 / n**0.5
     require(
         apart <= bound,

@@ -8,6 +8,7 @@ its own.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -97,10 +98,10 @@ class Guide(nn.Module):
         self.without_backdrop: Tensor | None = None
         self.register_load_state_dict_post_hook(lambda guide, _: guide.changed())
 
-    @property
+    @cached_property
     def needs_occupancy(self) -> bool:
         """Whether the sampler asks a gate at all; a grid does not. InputError if there is no such
-        one."""
+        one. Looked up once: hosts ask in every step, and to find another package's takes 30 ms."""
         return self._spec().needs_occupancy
 
     def _spec(self, kind: str | None = None) -> SamplerSpec:

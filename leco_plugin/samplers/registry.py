@@ -6,13 +6,10 @@ installed knows them, and modules are imported when a sampler is built, not when
 
 from __future__ import annotations
 
-import functools
 import importlib
 import inspect
-import os
-import sys
 import warnings
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
@@ -274,7 +271,7 @@ def foreign_entries(
     Args:
         kind: what an entry of this group has to name.
     """
-    entries = [entry for entry in _entries(group) if entry.name not in ours]
+    entries = [entry for entry in entry_points(group=group) if entry.name not in ours]
     loaded = {}
     for entry in entries:
         found = _load_entry(entry, kind)
@@ -285,30 +282,9 @@ def foreign_entries(
     return loaded
 
 
-def _entries(group: str) -> tuple[EntryPoint, ...]:
-    """The entries of a group, read anew only where a folder of `sys.path` has changed: a guided
-    host asks for its sampler in every step, and to read them takes 30 ms."""
-    return _read(entry_points, group, tuple((path, _changed(path)) for path in sys.path))
-
-
-@functools.lru_cache(maxsize=16)
-def _read(
-    reader: Callable[..., Iterable[EntryPoint]], group: str, _: tuple[tuple[str, int], ...]
-) -> tuple[EntryPoint, ...]:
-    return tuple(reader(group=group))
-
-
-def _changed(path: str) -> int:
-    """When something was last put into a folder or taken out, ns; 0 where there is none."""
-    try:
-        return os.stat(path or ".").st_mtime_ns
-    except OSError:
-        return 0
-
-
 def why_left_out(name: str) -> str | None:
     """What is wrong with a registered sampler; None where nothing is, or none has this name."""
-    for entry in _entries(GROUP):
+    for entry in entry_points(group=GROUP):
         found = _load_entry(entry, SamplerSpec) if entry.name == name else None
         if isinstance(found, str):
             return found

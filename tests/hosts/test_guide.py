@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from importlib.metadata import EntryPoint
+
 import pytest
 import torch
 from ball_occupancy import BOX, MARCH, ball, rays
@@ -43,6 +45,22 @@ def test_a_builder_that_asks_no_gate_is_told_so(monkeypatch: pytest.MonkeyPatch)
     guide = Guide("documented")
     assert isinstance(guide.estimator(BOX), torch.nn.Identity)
     assert guide.proposal(num_samples=4)(5) == 5
+
+
+def test_a_host_that_asks_in_every_step_has_packages_looked_through_once(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    entry = EntryPoint("mine", "leco_plugin.samplers.registry:DENSE", registry.GROUP)
+    looks = []
+
+    def entry_points(group: str) -> list[EntryPoint]:
+        looks.append(group)
+        return [entry]
+
+    monkeypatch.setattr(registry, "entry_points", entry_points)
+    guide = Guide("mine")
+    assert not any(guide.needs_occupancy for _ in range(3))
+    assert looks == [registry.GROUP]
 
 
 def test_only_a_sampler_that_has_levels_is_given_those_of_the_host(

@@ -100,10 +100,9 @@ def digest(command: Sequence[str], sources: Sequence[Path]) -> str:
     programs = [Path(found).resolve() for word in command if (found := shutil.which(word))]
     versions = [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in programs]
     sha = hashlib.sha256(repr((list(command), versions, processor())).encode())
-    for source in sources:
-        headers = sorted(source.parent.glob("*.h"))
-        for path in (source, *headers):
-            sha.update(path.read_bytes())
+    headers = {header for source in sources for header in source.parent.glob("*.h")}
+    for path in (*sources, *sorted(headers)):
+        sha.update(path.read_bytes())
     return sha.hexdigest()[:16]
 
 

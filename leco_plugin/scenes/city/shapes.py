@@ -49,21 +49,17 @@ class Shapes:
 
     def add_hull(self, corners: Array, faces: list[list[int]]) -> None:
         """Adds a convex solid given by its corners [V, 3] and planar faces (any winding)."""
-        first, second, third = corners[[face[:3] for face in faces]].swapaxes(0, 1)
-        (a, b, c), (d, e, f) = (second - first).T, (third - first).T
-        halves = np.empty((len(faces), 4))  # a city has thousands of hulls: np.cross takes longer
-        normals, offsets = halves[:, :3], halves[:, 3]
-        normals[:, 0], normals[:, 1], normals[:, 2] = b * f - c * e, c * d - a * f, a * e - b * d
-        normals /= np.sqrt((normals * normals).sum(axis=1, keepdims=True))
-        offsets[:] = np.einsum("hk,hk->h", normals, first)
+        first, second, third = np.moveaxis(corners[[face[:3] for face in faces]], 1, 0)
+        normals = np.cross(second - first, third - first)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        offsets = np.einsum("hk,hk->h", normals, first)
         flip = np.where(normals @ corners.mean(0) > offsets, -1.0, 1.0)
-        self.hulls.append((corners, halves * flip[:, None]))
+        self.hulls.append((corners, np.column_stack([normals, offsets]) * flip[:, None]))
 
     def add_polygon(self, polygon: Array, paint: int) -> None:
         """Adds a convex planar face [V, 3], counter-clockwise seen from the air."""
-        fan = np.empty((len(polygon) - 2, 3, 3))
-        fan[:, 0], fan[:, 1], fan[:, 2] = polygon[0], polygon[1:-1], polygon[2:]
-        self.triangles.append((fan, paint))
+        first = np.broadcast_to(polygon[0], (len(polygon) - 2, 3))
+        self.triangles.append((np.stack([first, polygon[1:-1], polygon[2:]], 1), paint))
 
     def add_between(
         self,
@@ -81,7 +77,7 @@ class Shapes:
         sides = [[i, count + i, count + (i + 1) % count, (i + 1) % count] for i in range(count)]
         for side, is_open in zip(sides, open_sides or count * [True]):
             if is_open:
-                self.add_polygon(corners[side[shared:] + side[:shared]], paint)
+                self.add_polygon(corners[np.roll(side, -shared)], paint)
         self.add_hull(corners, [*sides, list(range(count)), list(range(count, 2 * count))])
 
 
