@@ -41,6 +41,13 @@ def test_importing_the_package_loads_no_other() -> None:
     assert modules_after("import leco_plugin").isdisjoint({"torch", "numpy", "nerfstudio"})
 
 
+def test_an_occupancy_is_loaded_without_symbolic_mathematics() -> None:
+    """torch imports sympy to count on its meta device, which takes longer than all the rest."""
+    given = ROOT / "tests" / "data" / "occupancy.safetensors"
+    loading = f"from leco_plugin.occupancy import Occupancy; Occupancy.load({str(given)!r})"
+    assert "sympy" not in modules_after(loading)
+
+
 def test_the_version_is_that_of_the_distribution() -> None:
     assert leco_plugin.__version__ == version("leco-plugin")
 

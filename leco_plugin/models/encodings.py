@@ -54,8 +54,9 @@ class FrequencyEncoding(nn.Module):
     def __init__(self, octaves: int) -> None:
         super().__init__()
         self.out_dim = 3 + 6 * octaves
-        powers = 2.0 ** torch.arange(octaves, dtype=torch.float32)
-        self.register_buffer("scales", math.pi * powers, persistent=False)
+        # of lists, here and below: on the meta device, arange would first import all of sympy
+        scales = [math.pi * 2.0**octave for octave in range(octaves)]
+        self.register_buffer("scales", torch.tensor(scales, dtype=torch.float32), persistent=False)
         self.register_buffer("start", torch.tensor([0.0, -1.0]).view(2, 1, 1), persistent=False)
 
     def forward(self, mapped: Tensor, dtype: torch.dtype | None = None) -> Tensor:
@@ -163,9 +164,8 @@ class HashEncoding(nn.Module):
             [math.floor(coarsest * growth**level) for level in range(levels)], dtype=torch.float32
         )
         self.register_buffer("resolutions", resolutions, persistent=False)
-        self.register_buffer(
-            "offsets", torch.arange(levels, dtype=torch.int32) << log2_table, persistent=False
-        )
+        offsets = [level << log2_table for level in range(levels)]
+        self.register_buffer("offsets", torch.tensor(offsets, dtype=torch.int32), persistent=False)
         self.register_buffer("primes", torch.tensor(PRIMES, dtype=torch.int32), persistent=False)
         self.table = nn.Parameter(torch.empty(levels << log2_table, features).uniform_(-1e-4, 1e-4))
 
