@@ -209,9 +209,9 @@ def summary(report: dict[str, Any]) -> list[str]:
     if blocks := report["other_blocks"]:
         named = "; ".join(_some(block) for block in blocks[:NAMED])
         lines.append(
-            f"{sum(map(len, blocks))} of these are placed among themselves, and share too little "
-            f"with the rest: {named}; their models stay in colmap/models, and leco poses on a "
-            "block alone makes it a scene"
+            f"{sum(map(len, blocks))} of these fit together only in groups of their own, which "
+            f"share too little with the rest: {named}; for a scene of such a group, give leco "
+            "poses a folder with its photographs alone"
         )
     if placed <= FEW_PLACED * count:
         lines.append("more overlap between neighbours places more photographs")
@@ -231,5 +231,5 @@ def summary(report: dict[str, Any]) -> list[str]:
 
 
 def _some(names: list[str]) -> str:
-    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    more = f" and {len(names) - NAMED} more ({REPORT} has all)" if len(names) > NAMED else ""
     return ", ".join(names[:NAMED]) + more

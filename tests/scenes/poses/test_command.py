@@ -226,8 +226,8 @@ def test_of_two_blocks_the_largest_is_written_and_wrong_gps_is_not_used(
     assert report["other_blocks"] == [others]
     said = capsys.readouterr().out
     assert "6 of 10 photographs are placed" in said
-    assert "4 of these are placed among themselves, and share too little" in said
-    assert "leco poses on a block alone makes it a scene" in said
+    assert "4 of these fit together only in groups of their own, which share too little" in said
+    assert "give leco poses a folder with its photographs alone" in said
     kept = [pycolmap.Reconstruction(each) for each in (out / "colmap/models").glob("[0-9]*")]
     assert sorted(each.num_reg_images() for each in kept) == [4, 6]
     assert "no metres: GPS contradicts the poses: " in said and "mend EXIF" in said
@@ -278,7 +278,7 @@ def test_the_summary_names_some_and_counts_the_rest() -> None:
     assert summary(report) == [
         "8 of 20 photographs are placed, with 9 points (0.50 pixels mean error)",
         "left out, as they cannot be read: cut.jpg",
-        "not placed: 0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg and 7 more",
+        "not placed: 0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg and 7 more (poses.json has all)",
         "more overlap between neighbours places more photographs",
         "in metres by the GPS of 8 photographs: they are off by 1.23 m (median) and 5.00 m at most",
         "EXIF gives no altitude: heights count from the cameras, not the sea",
