@@ -40,24 +40,27 @@ STANDS = {
 def readme(text: str) -> str:
     """The README with its tables renewed."""
     text = between(text, DEMO, demo_sentence(json.loads((RESULTS / "demo.json").read_text())))
-    more = without_gifts(stored(GIFTS_CHART)), after_half_an_hour(), of_the_papers_host()
-    also = "".join(f" {part}" for part in more if part)
+    later = " ".join(filter(None, [after_half_an_hour(), of_the_papers_host()]))
     text = with_walk(text, ("lines",))
-    return between(text, GAIN, gain(also))
+    return between(text, GAIN, gain(without_gifts(stored(GIFTS_CHART)), later))
 
 
-def gain(also: str = "") -> str:
-    """What a learned occupancy gains, and what is to be known of that chart."""
+def gain(*also: str) -> str:
+    """What a learned occupancy gains: for the page of results, or with what else is to be known,
+    for the README, which leads with three numbers."""
     chart = stored(GAIN_CHART)
-    said = gain_table(chart, short=bool(also)) + also
-    return "\n\n".join([said, *filter(None, [noted(RESULTS).get(GAIN_CHART)])])
+    told = gain_table(chart), in_the_same_time(chart)
+    if also:
+        found = [in_the_same_time(chart, most=1), *also]
+        told = lead(chart), gain_table(chart), "\n".join(f"- {each}" for each in found)
+    return "\n\n".join([*told, *filter(None, [noted(RESULTS).get(GAIN_CHART)])])
 
 
 def after_half_an_hour() -> str:
     """What is left of the gain of the paper's model when there is time."""
     here, there = (lines_of(stored(name)) for name in HALF_HOUR_CHARTS.values())
     return (
-        f"After half an hour LeCO has {here[0].psnr:.1f} dB with a learned occupancy, "
+        f"**After half an hour** LeCO has {here[0].psnr:.1f} dB with a learned occupancy, "
         f"{here[1].psnr:.1f} without a gate; on a city {there[0].psnr:.1f} and {there[1].psnr:.1f} "
         "(one seed each)."
     )
@@ -106,7 +109,7 @@ def without_gifts(results: Mapping[str, Any]) -> str:
     ended = " and ".join(f"{psnr:.1f}" for psnr in without.psnrs if psnr not in failed)
     count = f", and {len(failed)} failed" if failed else ""
     return (
-        "Part of Instant-NGP's lead is how its run begins. In another test, of "
+        "**Part of Instant-NGP's lead** is how its run begins. In another test, of "
         f"{len(whole.psnrs)} seeds, runs end at {_psnrs(whole)} dB with all of it, at {ended} with "
         f"gate and bounds alone{count}, at {_psnrs(own)} with its own grid "
         "([more](docs/results.md#what-is-gained-in-the-same-time))."
@@ -153,22 +156,21 @@ def demo_table(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def lead(lines: Sequence[Line], seconds: float) -> str:
+def lead(results: Mapping[str, Any]) -> str:
     """Three numbers: of Instant-NGP, with a learned occupancy and with its own grid."""
-    host = [line for line in lines if line.method == "leco-ngp"]
+    host = [line for line in lines_of(results) if line.method == "leco-ngp"]
     ours = next(line for line in host if line.learned)
     own = next(line for line in host if "own grid" in line.name)
     image, of_own = (_median(line, "render_seconds_per_image") for line in (ours, own))
     return (
-        f"**Instant-NGP after {seconds:g} s** of one CPU core: {ours.psnr:.1f} dB with a learned "
-        f"occupancy, {own.psnr:.1f} with its own grid; an image in {image:.1f} s, not "
-        f"{of_own:.1f}; {_queries(ours)} queries a ray, not {_queries(own)}."
+        f"**Instant-NGP after {results['protocol']['seconds']:g} s** of one CPU core: "
+        f"{ours.psnr:.1f} dB with a learned occupancy, {own.psnr:.1f} with its own grid; an image "
+        f"in {image:.1f} s, not {of_own:.1f}; {_queries(ours)} queries a ray, not {_queries(own)}."
     )
 
 
-def gain_table(results: Mapping[str, Any], short: bool = False) -> str:
-    """Accuracy, rendering and queries of each contender, and `gains`; `short` leads with three
-    numbers."""
+def gain_table(results: Mapping[str, Any]) -> str:
+    """Accuracy, rendering and queries of each contender, and what the words mean."""
     lines = lines_of(results)
     seconds, scene = results["protocol"]["seconds"], results["scene"]["name"]
     cores, seeds = describe_cores(results["machine"]), describe_seeds(results)
@@ -182,17 +184,19 @@ def gain_table(results: Mapping[str, Any], short: bool = False) -> str:
         ]
         for line in lines
     ]
-    said = f"{lead(lines, seconds)}\n\n" if short else ""
-    said += "**In the same time,** with a learned occupancy"
-    said += ", beside the best of its other rows, " if short else ", "
-    said += gains(lines, 1 if short else None)
     words = (
         "A query asks a network about one point; *small* ones ask a proposal network or a gate. "
         "*LeCO* is the paper's model: several small networks, the *experts*. A *host* is a method "
         "that an occupancy guides. *Long steps* take fewer samples of each ray."
     )
     columns = f"{head} | PSNR | to render an image | queries a ray"
-    return "\n".join([said, "", *table(columns, rows), "", words])
+    return "\n".join([*table(columns, rows), "", words])
+
+
+def in_the_same_time(results: Mapping[str, Any], most: int | None = None) -> str:
+    """`gains`, as a sentence of its own."""
+    begin = "Beside the best of its other rows" if most else "In the same time"
+    return f"**{begin},** with a learned occupancy, {gains(lines_of(results), most)}"
 
 
 def gifts_sentence(results: Mapping[str, Any], anchor: str) -> str:

@@ -218,18 +218,19 @@ def test_the_gain_is_that_over_each_other_row_of_the_same_host() -> None:
         "scene": {"name": "fox"},
         "machine": {"cores": 4, "threads": 2, "device": "cpu"},
     }
-    said, _, head, _, ours, *_, words = parts.gain_table(chart).splitlines()
+    head, _, ours, *_, words = parts.gain_table(chart).splitlines()
     assert head == (
         "| `fox`, 120 s on 2 CPU cores, one seed | PSNR | to render an image | queries a ray |"
     )
     assert ours == (
         "| **leco-occupancy + learned-occupancy** | 28.0 dB (28.0 to 28.0) | 2.0 s | 15 + 5 small |"
     )
+    told = "**In the same time,** with a learned occupancy, "
     alone = (
         "leco-occupancy is beside *dense* by -1.0 dB, one seed: no verdict (renders 2.0 times as "
         "fast)."
     )
-    assert said == f"**In the same time,** with a learned occupancy, {alone}"
+    assert parts.in_the_same_time(chart) == f"{told}{alone}"
     assert words.startswith("A query asks a network about one point;")
     guided = [
         of("leco-nerfacto", "learned-occupancy", 30.0 + 0.1 * seed, (32.0, 0.0, 8.0))
@@ -241,9 +242,8 @@ def test_the_gain_is_that_over_each_other_row_of_the_same_host() -> None:
         for sampler, psnr in (("own", 25.0), ("long-steps", 30.1), ("dense", 31.0))
         for seed in range(3)
     ]
-    said, *_ = parts.gain_table(chart | {"runs": [*runs[:3], *guided, *own]}).splitlines()
-    assert said == (
-        "**In the same time,** with a learned occupancy, leco-nerfacto is behind *dense* by 1.0 ± "
+    assert parts.in_the_same_time(chart | {"runs": [*runs[:3], *guided, *own]}) == (
+        f"{told}leco-nerfacto is behind *dense* by 1.0 ± "
         "0.2 dB (renders 2.0 times as fast) and level with *long-steps* by -0.1 ± 0.2 dB (renders "
         "2.0 times as fast) and ahead of *own* by 5.0 ± 0.2 dB (renders 2.0 times as fast). "
         f"{alone}"
@@ -271,12 +271,16 @@ def test_what_is_around_the_tables_is_left_as_it_is(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(parts, "stored", lambda name: {})
     monkeypatch.setattr(parts, "demo_sentence", lambda report: "demo")
     monkeypatch.setattr(parts, "with_walk", lambda text, names: text)
-    monkeypatch.setattr(parts, "gain_table", lambda chart, short: "gain")
+    monkeypatch.setattr(parts, "lead", lambda chart: "lead")
+    monkeypatch.setattr(parts, "gain_table", lambda chart: "table")
+    monkeypatch.setattr(parts, "in_the_same_time", lambda chart, most=None: "gain")
     monkeypatch.setattr(parts, "without_gifts", lambda chart: "alone")
     monkeypatch.setattr(parts, "after_half_an_hour", lambda: "late")
+    monkeypatch.setattr(parts, "of_the_papers_host", lambda: "")
     (before, after), (begin, end) = parts.DEMO, parts.GAIN
     text = f"A\n{before}\nstale\n{after}\nB\n{begin}\n{end}\nC\n"
-    expected = f"A\n{before}\ndemo\n{after}\nB\n{begin}\ngain alone late\n{end}\nC\n"
+    parts_of_gain = "lead\n\ntable\n\n- gain\n- alone\n- late"
+    expected = f"A\n{before}\ndemo\n{after}\nB\n{begin}\n{parts_of_gain}\n{end}\nC\n"
     assert parts.readme(text) == expected
 
 
