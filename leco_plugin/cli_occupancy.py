@@ -56,7 +56,7 @@ def inspect(
     check_picture("--picture", picture)
     check_picture("--history", history, moving=True)
     from leco_plugin.evaluation.inspection import describe, doubts, scene_of
-    from leco_plugin.learning.quality import views_in_words
+    from leco_plugin.learning.quality import price_in_words, views_in_words
     from leco_plugin.occupancy import Occupancy
 
     file = occupancy_of(file)
@@ -69,12 +69,13 @@ def inspect(
     print(f"kept where o(x) >= {facts['threshold']:.4g}, asked in {facts['precision']}")
     print(f"kept share of its box: {facts['kept_share_of_box']:.2%}")
     print(f"share of its box that photographs show: {facts['seen_share_of_box']:.2%}")
-    for line in [views_in_words(facts["report"]), *doubts(facts)]:
+    report = facts["report"]
+    for line in [*price_in_words(report), views_in_words(report), *doubts(facts)]:
         print(line)
-    for name, value in facts["report"].items():
+    print("its report, whose keys docs/file-format.md explains:")
+    for name, value in report.items():
         if isinstance(value, (int, float, str)) and name not in ("params", "threshold"):
-            print(f"{name.replace('_', ' ')}: {_said(value)}")
-    print("docs/file-format.md says what each of these is")
+            print(f"  {name}: {_said(value)}")
     if picture is not None:
         _draw(occupancy, picture, scene_of(occupancy, file, data), dark)
     if history is not None:

@@ -44,7 +44,8 @@ def test_inspect_says_draws_and_writes(
 ) -> None:
     picture, report = tmp_path / "new" / "picture.png", tmp_path / "other" / "report.json"
     assert run("inspect", file, "--picture", picture, "--json", report) == 0
-    assert "o(x) >= 0.5" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "o(x) >= 0.5" in said and "  empty_fraction: 0.9\n" in said
     assert picture.stat().st_size > 20_000
     facts = json.loads(report.read_text())
     assert facts["format"] == 1 and facts["bytes"] == file.stat().st_size

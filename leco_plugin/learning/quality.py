@@ -47,6 +47,19 @@ def kept_of_seen(mixture: Mixture) -> float:
     return float(kept.double().mean())
 
 
+def price_in_words(report: dict[str, Any]) -> list[str]:
+    """What an occupancy's report says that skipping brings and costs: a line, or none where it does
+    not say it."""
+    names = "empty_fraction", "image_price_db", "lost_surface_mass"
+    skipped, price, lost = (report.get(name) for name in names)
+    if skipped is None or price is None or lost is None:
+        return []
+    return [
+        f"skips {skipped:.1%} of the candidates along rays, for {round(price, 3) + 0.0:+.3f} dB "
+        f"and {lost:.2%} of the surfaces, on the rays of its calibration"
+    ]
+
+
 def views_in_words(report: dict[str, Any]) -> str:
     """What an occupancy's report says of views that taught it nothing: a line."""
     said = report.get(CAMERAS_THAT_VOUCH)

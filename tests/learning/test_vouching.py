@@ -11,7 +11,7 @@ import torch
 from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 
 from leco_plugin.learning.calibration import CalibrationConfig, Measured
-from leco_plugin.learning.quality import views_in_words
+from leco_plugin.learning.quality import price_in_words, views_in_words
 from leco_plugin.learning.sharpening import Sharpened, SharpeningConfig
 from leco_plugin.models.gate import Gate
 from leco_plugin.occupancy import CAMERAS_THAT_VOUCH
@@ -65,6 +65,13 @@ def test_what_views_may_lose_is_said_in_a_line() -> None:
     line = views_in_words({CAMERAS_THAT_VOUCH: said})
     assert "0.12%" in line and "0.20%, with 90%" in line
     assert "may lose more" in views_in_words({}) == views_in_words({CAMERAS_THAT_VOUCH: None})
+
+
+def test_what_skipping_costs_is_said_in_a_line() -> None:
+    report = {"empty_fraction": 0.85, "image_price_db": -1e-4, "lost_surface_mass": 2.05e-4}
+    (line,) = price_in_words(report)
+    assert "skips 85.0%" in line and "+0.000 dB and 0.02% of the surfaces" in line
+    assert price_in_words(report | {"image_price_db": None}) == price_in_words({}) == []
 
 
 def test_a_report_of_a_small_gate_has_what_views_lose_by_it() -> None:
