@@ -17,7 +17,12 @@ from torch import Tensor, nn
 from leco_plugin.evaluation.clock import seconds_now
 from leco_plugin.hosts.guide import Guide
 from leco_plugin.hosts.stand_ins import is_packed
-from leco_plugin.learning.calibration import THRESHOLDS, CalibrationConfig, Measured
+from leco_plugin.learning.calibration import (
+    THRESHOLDS,
+    CalibrationConfig,
+    Measured,
+    promise_below,
+)
 from leco_plugin.learning.collapse import SUSPECTED_STEPS
 from leco_plugin.learning.dense import evaluating
 from leco_plugin.learning.freezing import leave_file
@@ -217,4 +222,4 @@ def _lowered(report: dict[str, Any], before: float, step: int, threshold: float)
     if threshold > 0.0:
         return {CALIBRATED_AT: before, **report, **lowered}
     known = {name: value for name, value in report.items() if name != CALIBRATED_AT}
-    return known | dict.fromkeys(Measured._fields, 0.0) | lowered
+    return known | dict.fromkeys(Measured._fields, 0.0) | promise_below(report, 0.0) | lowered

@@ -165,6 +165,16 @@ def promise(
     }
 
 
+def promise_below(report: Mapping[str, Any], threshold: float) -> dict[str, Any]:
+    """What a report says of photographs that vouch once its threshold has been lowered. They lose
+    no more by less, so that what they were asked at freezing still holds; by nothing, nothing. Of
+    a field that they have trained since, they could not vouch."""
+    said = report.get(CAMERAS_THAT_VOUCH)
+    if not said or threshold > 0.0:
+        return {}
+    return {CAMERAS_THAT_VOUCH: said | {"worst_surface_mass": 0.0, "bound": 0.0}}
+
+
 def _worst_so_far(spent: Mapping[str, Any]) -> float:
     """What the worst photograph that vouches has lost by a report; 0 where none is named."""
     return float((spent.get(CAMERAS_THAT_VOUCH) or {}).get("worst_surface_mass", 0.0))

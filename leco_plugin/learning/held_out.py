@@ -35,6 +35,10 @@ if TYPE_CHECKING:
     from leco_plugin.scenes.pixels.held_out_pixels import Share
 
 
+OF_SURFACES = ("lost_surface_mass", "lost_mass", "surface_error")
+"""What a report says of lost weight, which haze makes up for."""
+
+
 class HeldOut(PriceSource):
     """Held-out pixels, as a mixture renders them.
 
@@ -91,12 +95,17 @@ class HeldOut(PriceSource):
 
     @torch.no_grad()
     def lower(self, below: float, seed: int) -> Measured:
-        """The largest threshold below another one that is within the bounds for the field now."""
+        """The largest threshold below another one that is within the bounds for the field now. Of a
+        field that was begun anew it declares the surfaces that the first one lost by more."""
         config = self.guided
         rays, truth = self.rays(config.rays, seed, "all")
         with evaluating(self.mixture):
             rendering = dense_rendering(self.mixture, rays, truth, config.rays_at_once)
-            return calibrate(rendering, config, below=below, missed_only=True)
+            found = calibrate(rendering, config, below=below, missed_only=True)
+        if config is self.config or found.threshold == 0.0:
+            return found
+        report = self.mixture.report
+        return found._replace(**{name: report[name] for name in OF_SURFACES if name in report})
 
     def excesses(self, seed: int) -> dict[str, Tensor]:
         """What is lost near surfaces counts where the photographs miss it: where the gate skips,

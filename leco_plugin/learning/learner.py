@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from leco_plugin.evaluation.clock import seconds_now
+from leco_plugin.learning.calibration import promise_below
 from leco_plugin.learning.collapse import STEPS_PER_LOOK, StepPlan, is_dense, plan_of
 from leco_plugin.learning.freezing import advice_on, carry_over, leave_field, leave_file
 from leco_plugin.learning.held_out import HeldOut
@@ -345,7 +346,8 @@ class Learner:
         mixture, before, watched = self.mixture, float(self.mixture.threshold), self.watch.state
         found = from_first(lambda: self.held_out.lower(below, watched.rechecks), mixture.device)
         lowered = [*mixture.report.get("lowered", []), [step, found.threshold]]
-        mixture.freeze(found.threshold, mixture.report | found._asdict() | {"lowered": lowered})
+        known = mixture.report | promise_below(mixture.report, found.threshold)
+        mixture.freeze(found.threshold, known | found._asdict() | {"lowered": lowered})
         watched.evidence = {}
         now = "no threshold is low enough: " if below > 0.0 else ""
         now += "from now on nothing is skipped"

@@ -26,7 +26,7 @@ from leco_plugin.hosts.stand_ins import GuidedEstimator
 from leco_plugin.learning import price_watch
 from leco_plugin.learning.calibration import THRESHOLDS, CalibrationConfig
 from leco_plugin.learning.run import LearningOnly
-from leco_plugin.occupancy import CALIBRATED_AT, Occupancy
+from leco_plugin.occupancy import CALIBRATED_AT, CAMERAS_THAT_VOUCH, Occupancy
 
 BOX = torch.tensor([-4.0, -4.0, -4.0, 4.0, 4.0, 4.0])
 RAYS = 64
@@ -135,6 +135,14 @@ def test_figures_stay_those_of_the_calibrated_threshold_however_often_it_is_lowe
     assert once[CALIBRATED_AT] == twice[CALIBRATED_AT] == 0.4
     assert twice["threshold"] == 0.025 and twice["empty_fraction"] == 0.8
     assert twice["lowered"] == [[100, 0.1], [200, 0.025]]
+
+
+def test_where_nothing_is_skipped_photographs_that_vouch_lose_nothing() -> None:
+    said = {"count": 9, "worst_surface_mass": 1e-3, "bound": 2e-3, "confidence": 0.9}
+    report = {"empty_fraction": 0.8, "threshold": 0.4, CAMERAS_THAT_VOUCH: said}
+    assert host_watch._lowered(report, 0.4, 100, 0.1)[CAMERAS_THAT_VOUCH] == said
+    nothing = host_watch._lowered(report, 0.4, 100, 0.0)[CAMERAS_THAT_VOUCH]
+    assert nothing["worst_surface_mass"] == nothing["bound"] == 0.0 and nothing["count"] == 9
 
 
 def test_photographs_with_alpha_are_compared_as_the_host_renders_them(watched: Watched) -> None:

@@ -29,7 +29,7 @@ from leco_plugin.learning.price_watch import (
 from leco_plugin.learning.run import Progress, WatchState
 from leco_plugin.learning.schedule import ScheduleConfig
 from leco_plugin.models.rendering import Intervals
-from leco_plugin.occupancy import Occupancy
+from leco_plugin.occupancy import CAMERAS_THAT_VOUCH, Occupancy
 
 CONFIG = CalibrationConfig()
 
@@ -154,6 +154,42 @@ def test_the_threshold_is_lowered_to_one_within_the_bounds_or_to_none(
     said = " ".join(capsys.readouterr().out.split())
     assert "step 700: lost surface mass of skipping" in said
     assert ("from now on nothing is skipped" in said) == (found == 0.0)
+
+
+def lowered_to(found: Measured, monkeypatch: pytest.MonkeyPatch, restart: bool) -> dict[str, Any]:
+    """What a frozen gate's report says once its threshold has been lowered."""
+    monkeypatch.setattr(held_out, "dense_rendering", lambda *_: ())
+    monkeypatch.setattr(held_out, "calibrate", lambda *_, **__: found)
+    learner = guided(ARun(), restart)
+    learner.held_out.rays = lambda *_: (None, None)  # type: ignore[method-assign, assignment]
+    vouched = {"count": 9, "worst_surface_mass": 1e-3, "bound": 2e-3, "confidence": 0.9}
+    frozen = Measured(0.4, 1e-4, 2e-3, 0.01, 0.7, 3e-5)._asdict()
+    learner.mixture.report = {**frozen, CAMERAS_THAT_VOUCH: vouched}
+    learner._skip_less(700, "a reason", 0.4)
+    return learner.mixture.report
+
+
+def test_a_lowered_gate_of_a_field_begun_anew_declares_no_surface_of_its_haze(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = Measured(0.2, 0.3, 0.4, 0.02, 0.5, 0.1)  # nothing asks for surfaces of such a field
+    report = lowered_to(found, monkeypatch, restart=True)
+    assert Measured(*(report[name] for name in Measured._fields)).within(CONFIG)
+    assert (report["lost_surface_mass"], report["lost_mass"]) == (1e-4, 2e-3)
+    assert (report["image_price_db"], report["empty_fraction"]) == (0.02, 0.5)
+    assert lowered_to(found, monkeypatch, restart=False)["lost_surface_mass"] == 0.3
+    nothing = lowered_to(Measured(0.0, 0.0, 0.0, 0.0, 0.0), monkeypatch, restart=True)
+    assert nothing["lost_surface_mass"] == nothing["lost_mass"] == 0.0
+
+
+@pytest.mark.parametrize(("threshold", "lost"), [(0.2, 1e-3), (0.0, 0.0)])
+def test_photographs_that_vouch_lose_no_more_by_less_and_nothing_by_nothing(
+    threshold: float, lost: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = Measured(threshold, 0.0, 0.0, 0.0, 0.5)
+    said = lowered_to(found, monkeypatch, restart=False)[CAMERAS_THAT_VOUCH]
+    assert said["worst_surface_mass"] == lost and said["bound"] == 2.0 * lost
+    assert said["count"] == 9
 
 
 @pytest.fixture
