@@ -2,14 +2,16 @@
 
 It begins within the scene's bounds, where it keeps whatever a training ray can reach. From time to
 time its own rendering weights teach a small gate, as a frozen field does in `learning.sharpening`.
-The gate is calibrated on held-out rays, and guides from then on if it skips more within the same
-bounds. Weights are read at the seam of packed hosts, which ask for densities while they train.
+The gate is calibrated on held-out rays, and guides from then on if it skips more. The bounds hold
+what all gates of a run cost together. Weights are read at the seam of packed hosts, which ask for
+densities while they train.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -24,6 +26,7 @@ from leco_plugin.learning.calibration import (
     ERRORS,
     LOSSES,
     THRESHOLDS,
+    CalibrationConfig,
     Measured,
     added_costs,
     image_price,
@@ -39,7 +42,7 @@ from leco_plugin.models.gate import Gate
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.region import Region
 from leco_plugin.models.rendering import Intervals
-from leco_plugin.occupancy import Occupancy
+from leco_plugin.occupancy import CALIBRATED_AT, CAMERAS_THAT_VOUCH, Occupancy
 from leco_plugin.samplers.base import midpoints, prune
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.packed import accumulate_along_rays, pack_info, render_weight_from_density
@@ -56,6 +59,10 @@ HELD_OUT_RAYS = 2048
 """Rays on which a gate is calibrated; each threshold that is tried renders them."""
 NO_ERROR = 1e-12
 """Summed squared error of rays that is as good as none."""
+BOUNDED = ("lost_surface_mass", "image_price_db")
+"""What calibration bounds, by its names in a config and in a report."""
+OF_A_GATE = (CALIBRATED_AT, CAMERAS_THAT_VOUCH)
+"""What a report says of one gate alone, and not of the next."""
 LOWER = 3
 """Steps of `THRESHOLDS` from one that costs too much to the next that is tried."""
 
@@ -163,7 +170,8 @@ class Along:
                 before.precision,
                 seed=step,
             )
-            found = self._calibrated(gate, held_out, bundle, truth)
+            allowed = self._allowed(before.report, last=step + 1 >= self.run.end)
+            found = self._calibrated(gate, held_out, bundle, truth, allowed)
         seconds = seconds_now() - started
         skipped = 1.0 - float(held_out.kept.float().mean())
         what = f"step {step}: a gate taught by the host in {seconds:.0f} s"
@@ -172,7 +180,8 @@ class Along:
             return
         say(f"{what} {found.line}, where {skipped:.1%} were skipped")
         costs = found._asdict() | added_costs(found._asdict(), before.report)
-        report = {**before.report, **costs, "step": step, "learned": "along"}
+        known = {name: value for name, value in before.report.items() if name not in OF_A_GATE}
+        report = {**known, **costs, "step": step, "learned": "along"}
         report |= {"params": sum(p.numel() for p in gate.parameters())}
         report |= {"train_seconds": round(self.spent + seconds, 2), "calibration_rays": len(truth)}
         made = before.with_gate(gate, found.threshold, report)
@@ -231,9 +240,26 @@ class Along:
             guide.listener, guide.kept = None, kept
             self.host.train(was_training)
 
-    def _calibrated(self, gate: Gate, heard: Heard, bundle: Any, truth: Tensor) -> Measured | None:
-        """The largest threshold within the bounds, and what it costs; None where none is."""
-        config, before = self.config.calibration, self.guide.the_occupancy()
+    def _allowed(self, report: Mapping[str, Any], last: bool) -> CalibrationConfig:
+        """What a gate may cost together with those before it, whose report this is. Half of what
+        they have left of the bounds is kept for later gates, which a better field teaches; the last
+        gate of a run may spend all."""
+        config = self.config.calibration
+        left = 0.0 if last else 0.5
+        bounds = {name: getattr(config, name) for name in BOUNDED}
+        spent = {name: max(0.0, float(report.get(name) or 0.0)) for name in BOUNDED}
+        return replace(config, **{n: b + left * (spent[n] - b) for n, b in bounds.items()})
+
+    def _calibrated(
+        self, gate: Gate, heard: Heard, bundle: Any, truth: Tensor, config: CalibrationConfig
+    ) -> Measured | None:
+        """The largest threshold within the bounds of a config, together with what gates before it
+        have cost, and what it costs; None where none is."""
+        before = self.guide.the_occupancy()
+
+        def within(found: Measured) -> bool:
+            return found._replace(**added_costs(found._asdict(), before.report)).within(config)
+
         asked = before.with_gate(gate, THRESHOLDS[0], {})
         with torch.no_grad():
             reference = heard.reference(asked.of_mapped(heard.mapped))
@@ -245,13 +271,13 @@ class Along:
             while number < len(THRESHOLDS):
                 threshold = THRESHOLDS[number]
                 found = measure(rendering, threshold, with_image=False)
-                if not found._replace(image_price_db=0.0, price_error_db=0.0).within(config):
+                if not within(found._replace(image_price_db=0.0, price_error_db=0.0)):
                     number += 1
                     continue
                 self.guide.set_occupancy(asked.with_threshold(threshold))
                 price, error = image_price(self._errors(bundle, truth), errors, NO_ERROR)
                 found = found._replace(image_price_db=price, price_error_db=error)
-                if found.within(config):
+                if within(found):
                     return found
                 number += LOWER
         finally:

@@ -21,7 +21,7 @@ from leco_plugin.learning.sharpening import SharpeningConfig
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.leco_config import LecoModelConfig
-from leco_plugin.occupancy import Occupancy
+from leco_plugin.occupancy import CALIBRATED_AT, CAMERAS_THAT_VOUCH, Occupancy
 from leco_plugin.samplers.packed import accumulate_along_rays, render_weight_from_density
 from leco_plugin.scenes.input_error import InputError
 
@@ -137,6 +137,43 @@ def test_what_costs_too_much_in_the_image_is_not_followed(made: Any) -> None:
     made.teacher.after_step(1)
     assert made.guide.the_occupancy().threshold == pytest.approx(OPEN)
     assert not list(made.out.iterdir())
+
+
+def test_all_its_gates_together_cost_no_more_than_the_bound(
+    made: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    price = [0.03]  # dB; the bound is 0.04
+
+    def errors(*_: Any) -> Tensor:
+        skips = made.guide.the_occupancy().threshold > OPEN
+        return torch.full((500,), 10.0 ** (0.1 * price[0]) if skips else 1.0)
+
+    monkeypatch.setattr(made.teacher, "_errors", errors)
+    for step in range(2):
+        made.teacher.after_step(step)
+    assert made.guide.the_occupancy().threshold == pytest.approx(OPEN), "half is for later gates"
+    made.teacher.run.end = 3
+    made.teacher.after_step(2)
+    first = made.guide.the_occupancy()
+    assert first.threshold > OPEN, "the last gate may spend all of it"
+    assert first.report["image_price_db"] == pytest.approx(0.03, abs=1e-3)
+    opened = bounds_of(first)  # from which any gate skips more
+    for spent, follows in ((0.005, True), (0.03, False)):
+        made.guide.set_occupancy(
+            opened.with_threshold(OPEN, opened.report | {"image_price_db": spent})
+        )
+        made.teacher._teach(2)
+        assert (made.guide.the_occupancy().threshold > OPEN) == follows
+
+
+def test_a_new_gate_has_no_figures_of_the_one_before(made: Any) -> None:
+    before = made.guide.the_occupancy()
+    said = {CALIBRATED_AT: 0.3, CAMERAS_THAT_VOUCH: {"count": 9}, "lowered": [[100, 0.1]]}
+    made.guide.set_occupancy(before.with_threshold(OPEN, before.report | said))
+    made.teacher._teach(1)
+    report = made.guide.the_occupancy().report
+    assert report["threshold"] > OPEN and report["lowered"] == [[100, 0.1]]
+    assert CALIBRATED_AT not in report and CAMERAS_THAT_VOUCH not in report
 
 
 def test_teaching_takes_its_share_of_the_time(made: Any, monkeypatch: pytest.MonkeyPatch) -> None:
