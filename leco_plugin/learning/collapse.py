@@ -92,7 +92,7 @@ def look(progress: Progress, step: int, kept: float, shares: Tensor, last: bool)
     if step + 1 - progress.began < FEWEST_STEPS:
         return None
     collapse = find_collapse(kept, shares, last or progress.fewest_kept < HAS_LEARNED)
-    if collapse is None or (collapse.kind == "occupied" and progress.left_occupied):
+    if collapse is None or (collapse.kind != "empty" and progress.left_alone):
         progress.suspected_since = -1
         return None
     if progress.suspected_since < 0:
@@ -118,7 +118,7 @@ def action_on(
     if progress.recoveries < MOST_RECOVERIES:
         return "heal"
     # slow, and never wrong: what can be skipped is skipped
-    return "leave for good" if collapse.kind == "occupied" else "give up"
+    return "give up" if collapse.kind == "empty" else "leave for good"
 
 
 def heal(

@@ -73,7 +73,7 @@ class Recoveries:
         elif action == "give up":
             raise GateCollapsed(f"{cause}, after {MOST_RECOVERIES} recoveries. {REMEDY}")
         elif action == "leave for good":
-            progress.left_occupied, progress.suspected_since = True, -1
+            progress.left_alone, progress.suspected_since = True, -1
             say(f"{cause}, after {MOST_RECOVERIES} recoveries; it is left as it is")
         return action == "heal"
 

@@ -145,8 +145,9 @@ class Progress:
     """Share of candidates that are shaded while the gate is learned, a running mean."""
     sharpened_at: int = -1
     """Step at which a small gate was last taught; -1 is none."""
-    left_occupied: bool = False
-    """Whether a gate that calls everything occupied after all its recoveries is left so."""
+    left_alone: bool = False
+    """Whether a gate that calls everything occupied, or needs one scene expert only, after all its
+    recoveries is left so."""
     decisions: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.bool))
     """[P] bool, what the gate decided of the probe positions at the last check."""
 

@@ -11,6 +11,7 @@ from leco_plugin.learning.collapse import (
     EASED,
     MOST_RECOVERIES,
     Collapse,
+    action_on,
     annealed,
     find_collapse,
     form_of,
@@ -65,6 +66,14 @@ def test_a_healed_gate_learns_on_dense_samples_first_and_under_less_pressure(kin
     assert ends.imbalance == pytest.approx(pull * losses.imbalance)
     assert ends.emphasis == pytest.approx(losses.emphasis / pull)
     assert ends.balance == losses.balance
+
+
+@pytest.mark.parametrize("last", [False, True])
+def test_after_all_recoveries_only_a_gate_that_keeps_nothing_ends_the_run(last: bool) -> None:
+    progress = Progress(learn_steps=200, recoveries=MOST_RECOVERIES)
+    actions = {"empty": "give up", "occupied": "leave for good", "one expert": "leave for good"}
+    for kind, action in actions.items():
+        assert action_on(Collapse("a cause", kind), progress, last, room=1000.0) == action  # type: ignore[arg-type]
 
 
 def test_a_form_that_was_given_up_stays_given_up() -> None:

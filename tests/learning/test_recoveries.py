@@ -247,15 +247,21 @@ def test_without_steps_to_heal_it_in_a_gate_is_frozen_with_what_it_has_learned(
     assert torch.equal(run.mixture.gate.head.weight, before)
 
 
+ONE_EXPERT = [[20.0, 0.0, 0.0], [0.0, 20.0, 0.0]] * 50
+
+
+@pytest.mark.parametrize(
+    ("looks", "steps"), [([[0.0, 20.0, 20.0 - 1e-3]] * 100, 1900), (ONE_EXPERT, 1650)]
+)
 def test_a_gate_that_is_left_as_it_is_is_said_so_once_and_is_no_longer_suspected(
-    healthy_run, monkeypatch
+    looks: list[list[float]], steps: int, healthy_run, monkeypatch
 ) -> None:
     lines: list[str] = []
     monkeypatch.setattr(recoveries, "say", lines.append)
     run = healthy_run(ScheduleConfig(learn_steps=2000))
     run.progress.recoveries, run.progress.fewest_kept = MOST_RECOVERIES, 0.5
-    run.looks = torch.tensor([[0.0, 20.0, 20.0 - 1e-3]]).expand(100, 3)
-    list(steps_of(run, 1900))
+    run.looks = torch.tensor(looks)
+    list(steps_of(run, steps))
     assert len(lines) == 1 and "it is left as it is" in lines[0]
     assert run.progress.suspected_since == -1
 
