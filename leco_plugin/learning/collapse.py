@@ -258,8 +258,9 @@ def plan_of(
     `frozen` whether the gate is frozen."""
     ramped = ramp(step - progress.began, schedule_since(config.schedule, progress))
     coarse = learning or ramped < 1.0
-    # a homogeneous gate is taught nothing about emptiness
-    follows = coarse and ramped > 0.0 and not is_dense(progress, step) and not config.homogeneous
+    # a homogeneous gate is taught nothing about emptiness; a frozen one goes by its threshold
+    followed = not (frozen or config.homogeneous or is_dense(progress, step))
+    follows = followed and coarse and ramped > 0.0
     return StepPlan(
         step,
         coarse,

@@ -40,6 +40,15 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Any:
     return SimpleNamespace(learner=learner, sampler=sampler, progress=learner.progress)
 
 
+@pytest.mark.parametrize("frozen", [False, True])
+def test_only_a_gate_that_is_being_learned_leaves_out_what_it_calls_empty(frozen: bool) -> None:
+    """A gate that was frozen early, with all kept, is followed no longer while the ramp goes on."""
+    learner = small_learner(schedule=ScheduleConfig(learn_steps=100, ramp_to=1.0))
+    if frozen:
+        learner.mixture.freeze(0.0, {"empty_fraction": 0.0})
+    assert (learner.before_step(90).following is None) == frozen
+
+
 @pytest.mark.parametrize(
     ("empty_fraction", "factor"), [(0.0, 0.5), (0.75, 2.0), (0.875, 4.0), (0.999, 4.0)]
 )
