@@ -124,7 +124,8 @@ NOTHING: Mapping[str, Any] = MappingProxyType({})
 def added_costs(found: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, float]:
     """What skipping costs on top of what earlier skipping has cost, and standard errors."""
     known = {name: float(before.get(name) or 0.0) for name in (*LOSSES, *ERRORS)}
-    costs = {name: max(0.0, found[name]) + max(0.0, known[name]) for name in LOSSES}
+    # in this order NaN stays NaN
+    costs = {name: max(found[name], 0.0) + max(known[name], 0.0) for name in LOSSES}
     return costs | {name: math.hypot(found[name], known[name]) for name in ERRORS}
 
 
@@ -136,7 +137,7 @@ def worst_loss(cameras: Sequence[Reference], threshold: float) -> float:
         surface = reference.surface_weights
         lost = float((surface * reference.skipped(threshold)).sum())
         losses.append(lost / max(float(surface.sum()), 1e-12))
-    return max(losses)
+    return float(torch.tensor(losses, dtype=torch.float64).max())  # NaN where any is
 
 
 def promise(
@@ -332,7 +333,7 @@ def calibrate(
     if earlier > config.camera_surface_mass:
         earlier = 0.0  # no threshold did justice to that view; others are still looked after
     for threshold in thresholds_below(below):
-        beyond = worst_loss(cameras, threshold) + earlier > config.camera_surface_mass
+        beyond = not worst_loss(cameras, threshold) + earlier <= config.camera_surface_mass
         if best is not None and beyond:
             continue
         if not missed_only:

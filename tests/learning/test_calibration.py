@@ -226,6 +226,25 @@ def test_what_a_photograph_loses_never_falls_as_the_threshold_rises() -> None:
     assert losses == sorted(losses) and losses[0] < losses[-1] < 1.0
 
 
+def test_a_photograph_whose_loss_is_no_number_vouches_for_nothing() -> None:
+    problem, sound = Problem(0), Chunk(3).reference
+    broken = sound._replace(weights=sound.weights.masked_fill(sound.near_surface, math.nan))
+    assert math.isnan(worst_loss([sound, broken, sound], 0.1))
+    config = CalibrationConfig(1.0, 100.0, camera_surface_mass=1.0)
+    trusting = calibrate(problem.rendering(), config, cameras=[sound])
+    doubting = calibrate(problem.rendering(), config, cameras=[broken])
+    assert trusting.threshold == doubting.threshold == THRESHOLDS[0]
+    assert not math.isnan(promise([sound], trusting, config)["bound"])
+    assert math.isnan(promise([broken], doubting, config)["bound"])
+
+
+def test_a_cost_that_is_no_number_is_not_taken_for_none() -> None:
+    found = Measured(0.5, math.nan, 0.1, math.nan, 0.5)._asdict()
+    costs = added_costs(found, {"image_price_db": 0.01})
+    assert math.isnan(costs["image_price_db"]) and math.isnan(costs["lost_surface_mass"])
+    assert costs["lost_mass"] == 0.1
+
+
 def test_nothing_is_skipped_when_no_threshold_fits() -> None:
     problem = Problem(0)
     for reference in problem.references:
