@@ -68,7 +68,7 @@ def as_learned(occupancy: Occupancy) -> Occupancy:
     the weights of such a gate are those of a new one: a history holds the real ones. ValueError if
     the report is damaged."""
     learned = occupancy.report.get("learned")
-    if learned is None:
+    if learned is None or learned == "along":  # by a host, with no larger gate before
         return occupancy
     try:
         config, threshold = GateConfig.from_dict(learned["gate"]), float(learned["threshold"])

@@ -84,3 +84,8 @@ def test_a_damaged_report_names_no_learned_gate(learned: Any) -> None:
     occupancy = Occupancy(a_gate(), Space(), 0.5, report={"learned": learned})
     with pytest.raises(ValueError, match="names no gate as `learned`"):
         as_learned(occupancy)
+
+
+def test_a_gate_that_a_host_taught_along_is_as_it_was_learned() -> None:
+    occupancy = Occupancy(a_gate(), Space(), 0.5, report={"learned": "along"})
+    assert as_learned(occupancy) is occupancy
