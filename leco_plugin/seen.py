@@ -22,7 +22,7 @@ CELLS = 64
 """Along each axis of the mapped cube."""
 BYTES = CELLS**3 // 8
 """Of all cells as bits, before they are compressed."""
-RAYS_AT_ONCE = 1 << 14
+RAYS_AT_ONCE = 1 << 12
 
 
 class SeenSpace(nn.Module):
@@ -47,13 +47,10 @@ class SeenSpace(nn.Module):
 
         A cell beside a crossed one counts as seen: rays are lines, and pixels have a width.
         """
-        cell = 2.0 / CELLS
-        # beyond the inner cube mapped steps shrink at least as fast as distance grows
-        growth = cell if space.kind == "contraction" else 0.0
-        rule = marching.March(cell * float(space.half_extent), growth)
         crossed = torch.zeros(CELLS**3, dtype=torch.bool, device=self.cells.device)
         for first in range(0, len(rays.origins), RAYS_AT_ONCE):
             part = marching.Rays(*(each[first : first + RAYS_AT_ONCE] for each in rays[:4]))
+            rule = _rule_for(space, part.origins)
             samples = marching.march(part, rule)
             mapped = space.map(midpoints(samples, part.origins, part.directions))
             inside = mapped.abs().amax(dim=-1) <= 1.0
@@ -74,6 +71,18 @@ class SeenSpace(nn.Module):
         """A state without cells changes nothing: files of occupancies keep them apart."""
         if f"{prefix}cells" in state_dict:
             super()._load_from_state_dict(state_dict, prefix, *rest)
+
+
+def _rule_for(space: Space, origins: Tensor) -> marching.March:
+    """By which rays from these origins [N, 3], N > 0, meet each cell that they cross, or one beside
+    it."""
+    cell, half = 2.0 / CELLS, float(space.half_extent)
+    if space.kind == "box":
+        return marching.March(cell * half)
+    # beyond the inner cube mapped steps shrink at least as fast as distance grows; in it they are
+    # two cells at most, also from far away
+    away = float((origins - space.center).norm(dim=-1).max()) / half
+    return marching.March(cell * half, cell * min(1.0, 4.0 / (1.0 + away)))
 
 
 def cells_at(mapped: Tensor) -> Tensor:
