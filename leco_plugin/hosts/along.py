@@ -132,8 +132,12 @@ class Along:
         self.steps, self.began, self.spent = 0, seconds_now(), 0.0
 
     def begin(self) -> None:
-        """Guides the host by bounds alone, where it has no occupancy yet."""
-        if self.guide.occupancy is None:
+        """Guides the host by bounds alone, where it has no occupancy yet; where it has taught one,
+        as in a run that goes on, the next is due once that has been its share of the time."""
+        given = self.guide.occupancy
+        if given is not None and given.report.get("learned") == "along":
+            self.steps, self.spent = FIRST, float(given.report["train_seconds"])
+        elif given is None:
             config = self.config
             data = LearningData(self.manager, config.bounds, config.near, config.far)
             self.guide.set_occupancy(open_occupancy(data, config.sharpening))

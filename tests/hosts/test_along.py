@@ -192,6 +192,18 @@ def test_teaching_takes_its_share_of_the_time(made: Any, monkeypatch: pytest.Mon
     assert taught[0] == 1 and 3 <= len(taught) <= 4, "a tenth of the time"
 
 
+def test_a_run_that_goes_on_teaches_at_its_end(made: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    made.teacher._teach(1)
+    run, taught = SimpleNamespace(end=10), list[int]()
+    again = Along(made.host, made.guide, CONFIG, made.pipe, run)  # type: ignore[arg-type]
+    again.begin()
+    assert again.spent == made.guide.the_occupancy().report["train_seconds"] > 0.0
+    monkeypatch.setattr(again, "_teach", taught.append)
+    for step in (7, 8, 9):
+        again.after_step(step)
+    assert taught == [9]
+
+
 def test_a_gate_is_said_to_have_cost_all_the_teaching_until_then(made: Any) -> None:
     made.teacher.spent = 100.0
     made.teacher._teach(1)
