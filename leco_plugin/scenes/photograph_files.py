@@ -8,6 +8,7 @@ Of a mask, each pixel that is not 0 counts as seen.
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 import warnings
 from collections.abc import Callable, Iterator
@@ -22,7 +23,7 @@ from PIL import ExifTags, Image
 
 from leco_plugin.log import by_number, counted, say
 from leco_plugin.scenes.input_error import InputError, one_line
-from leco_plugin.scenes.whole_files import write_whole
+from leco_plugin.scenes.whole_files import LONGEST, write_whole
 
 READ_RIGHTLY = ("L", "RGB", "RGBA")
 """Pillow's modes of images that nerfstudio reads as they are."""
@@ -80,8 +81,10 @@ def header_of(path: Path) -> Header:
     except Image.DecompressionBombError:
         most = f"{2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f} megapixels that Pillow opens"
         raise InputError(f"{path} has more than the {most}: make it smaller") from None
+    except PermissionError as error:
+        raise InputError(f"{path}: {error.strerror}: give yourself the right to read it") from None
     except (OSError, ValueError, EOFError, SyntaxError):
-        if not path.exists():
+        if not os.path.exists(path):
             raise InputError(f"the image {path} is not there{remedy_for_missing(path)}") from None
         raise InputError(f"{path} cannot be read as an image: {SAVE_ANEW}") from None
 
@@ -108,14 +111,14 @@ def find_file(path: Path) -> Path:
     """A file of that name, of its name with slashes, or of one of these with an ending."""
     for name in (str(path), str(path).replace("\\", "/")):
         for ending in ("", ".png", ".jpg", ".jpeg", ".JPG"):
-            if (there := Path(name + ending)).is_file():
-                return there
+            if os.path.isfile(name + ending):  # pathlib raises for a name that is too long
+                return Path(name + ending)
     return path
 
 
 def check_images(paths: list[Path]) -> None:
     """InputError if an image is not there."""
-    if missing := [path for path in paths if not path.exists()]:
+    if missing := [path for path in paths if not os.path.exists(path)]:
         some = f"{len(missing)} of {counted(len(paths), 'image')}"
         some += by_number(len(missing), " is", " are") + " not there, the first is"
         raise InputError(f"{some} {missing[0]}{remedy_for_missing(missing[0])}")
@@ -131,6 +134,16 @@ def remedy_for_missing(path: Path) -> str:
             f": make it, 1/{smaller[2]} of the width and height of its photograph in {smaller[1]}, "
             "or give --downscale-factor 1 after the name of the reader"
         )
+    if os.path.islink(path):
+        return f": it is a link to {path.readlink()}, which is not there"
+    for name in sorted(os.listdir(path.parent)) if path.parent.is_dir() else ():
+        if Path(name).stem.lower() == path.stem.lower():
+            return f": there is {name}, write its name like that"
+        if not path.suffix and name.startswith(f"{path.name} "):
+            return (
+                f": there is {name}, and nerfstudio reads names in COLMAP's .txt files up to a "
+                "blank: give its .bin files, or names without blanks"
+            )
     return ": put it there, or leave its frame out"
 
 
@@ -211,7 +224,7 @@ class DerivedImages:
         status = source.stat()
         known_by = f"{source.resolve()} {status.st_size} {status.st_mtime_ns} {recipe}"
         digest = hashlib.blake2b(known_by.encode(), digest_size=8).hexdigest()
-        path = self.folder / f"{source.stem}-{digest}.png"
+        path = self.folder / f"{source.stem[-LONGEST:]}-{digest}.png"
         if not path.exists():
             self.put(path, make())
         return path

@@ -15,6 +15,8 @@ if TYPE_CHECKING:  # `leco --help` loads no numpy for it
 
 PART = ".part"
 """How the names of unfinished files end."""
+LONGEST = 40
+"""Letters of a name that an unfinished file has too: of 255 bytes each takes up to 4."""
 PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar"}
 
 
@@ -22,7 +24,8 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Lets `write` fill a file beside `path`, and moves it there; folders are made. Of several
     processes at once the last one wins."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}{PART}")
+    known = f"{path.name[-LONGEST:]}.{os.getpid()}-{threading.get_ident()}"
+    part = path.with_name(f".{known}{PART}")
     try:
         with part.open("wb") as file:
             write(file)

@@ -165,6 +165,45 @@ def test_names_as_windows_and_instant_ngp_write_them_are_found(tmp_path: Path) -
         check_images([find_file(tmp_path / "images\\b.png")])
 
 
+@pytest.mark.parametrize(
+    ("named", "there", "why"),
+    [
+        ("a.jpg", "a.JPG", "there is a.JPG, write its name like that"),
+        ("a.jpg", "A.png", "there is A.png, write its name like that"),
+        ("a", "a b.jpg", r"there is a b\.jpg, .* up to a blank: give its \.bin files, or names .*"),
+        ("a.jpg", "b.jpg", "put it there, or leave its frame out"),
+    ],
+)
+def test_a_photograph_that_is_missing_is_told_from_a_wrong_name(
+    named: str, there: str, why: str, tmp_path: Path
+) -> None:
+    (tmp_path / there).touch()
+    for check in (lambda path: check_images([path]), header_of):
+        with refused(f"not there.*: {why}$"):
+            check(tmp_path / named)
+
+
+def test_a_link_that_leads_nowhere_and_a_name_that_is_too_long_are_missing(tmp_path: Path) -> None:
+    link, long = tmp_path / "a.jpg", tmp_path / ("a" * 300)
+    link.symlink_to("/nowhere/b.jpg")
+    with refused("1 of 1 image is not there.*a.jpg: it is a link to /nowhere/b.jpg, which is not"):
+        check_images([link])
+    assert find_file(long) == long
+    with refused("1 of 1 image is not there"):
+        check_images([long])
+
+
+def test_a_photograph_that_may_not_be_read_is_not_called_damaged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, mode: str) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "open", refuse)
+    with refused(r"a\.jpg: Permission denied: give yourself the right to read it"):
+        header_of(tmp_path / "a.jpg")
+
+
 def test_a_smaller_picture_that_is_missing_has_a_way_around(tmp_path: Path) -> None:
     with refused(r"make it, 1/2 of .*--downscale-factor 1"):
         header_of(tmp_path / "images_2" / "a.png")
@@ -215,6 +254,12 @@ def test_a_source_that_is_no_picture_leaves_nothing(source: Path, tmp_path: Path
     with refused(r"a\.png cannot be read as a picture"):
         DerivedImages(tmp_path / "cache").get(source, "copy", lambda: open_image(source))
     assert not (tmp_path / "cache").exists()
+
+
+def test_a_source_with_the_longest_name_that_there_is_has_a_picture(tmp_path: Path) -> None:
+    source = write(tmp_path / ("\u6d77" * 83 + ".png"), "RGB")
+    path = DerivedImages(tmp_path / "cache").get(source, "copy", lambda: open_image(source))
+    assert path.is_file()
 
 
 def test_a_place_that_cannot_be_written_is_named_with_the_remedy(source: Path) -> None:

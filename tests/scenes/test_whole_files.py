@@ -16,6 +16,12 @@ def test_a_file_replaces_the_old_one_and_makes_its_folder(tmp_path: Path) -> Non
     assert [p.name for p in path.parent.iterdir()] == ["file"]
 
 
+def test_a_file_may_have_the_longest_name_that_there_is(tmp_path: Path) -> None:
+    path = tmp_path / ("\u6d77" * 83 + ".jpg")  # 253 bytes of 255
+    write_whole(path, lambda file: file.write(b"whole"))
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
 def test_a_failure_leaves_the_old_file_and_no_part(tmp_path: Path) -> None:
     path = tmp_path / "file"
     path.write_bytes(b"old")
