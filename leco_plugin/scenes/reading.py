@@ -7,6 +7,7 @@ is read wrongly is looked for in what they return.
 from __future__ import annotations
 
 import functools
+import re
 from collections import Counter
 from contextlib import nullcontext
 from dataclasses import replace
@@ -128,8 +129,14 @@ def _remedy(error: BaseException, config: Any) -> str:
         return "list photographs in val_filenames and test_filenames too, or remove train_filenames"
     if "camera model" in _reason(error).lower():
         return "undistort the photographs with `colmap image_undistorter`, and give that model"
-    if "\\" in str(error).replace("\\\\", "\\"):
+    if re.search(r"\w\\{1,2}\w", str(error)):
         return "its names were written by Windows: write / for each backslash"
+    if re.search(r"\.(png|jpe?g)\.png\b", str(error), re.IGNORECASE):
+        return f"{name} adds .png to each file_path, and reads no other kind: leave endings off"
+    if hasattr(config, "images_path") and not (data / config.images_path).is_dir():
+        return "name the folder of its photographs with --images-path after colmap"
+    if isinstance(error, ZeroDivisionError):
+        return "add photographs: a scene is seen from two places at least"
     if isinstance(error, UnidentifiedImageError):
         return photograph_files.SAVE_ANEW
     if isinstance(error, FileNotFoundError | NotADirectoryError):
@@ -185,7 +192,7 @@ def checked(
         if unread and all(named):
             outputs.mask_filenames = [scene.mask(str(path)) for path in named]
         if speak:
-            scene_file.say_unused(scene.meta, scene.path)
+            scene_file.say_unused(scene.meta, scene.path, cameras.times is not None)
     made = torch.cat([cameras.width, cameras.height], dim=-1).expand(len(images), -1).tolist()
     sizes = [_size_of(*each, factor) for each in zip(images, headers, lenses, made)]
     cameras.width, cameras.height = torch.tensor(sizes).to(cameras.width).split(1, dim=1)

@@ -224,10 +224,10 @@ NEEDLESS = {
     *("aabb", "aabb_scale", "blur_score", "colmap_im_id", "colmap_image_id", "depth_file_path"),
     *("depth_path", "depth_unit_scale_factor", "enable_depth_loading", "enable_ray_loading"),
     *("geographic_origin", "importance_sampling", "integer_depth_scale", "n_extra_learnable_dims"),
-    *("offset", "render_aabb", "scale", "sharpness", "timestamp"),
+    *("offset", "render_aabb", "rotation", "scale", "sharpness", "timestamp"),
 }
 """Neither geometry nor colour depends on them: bounds come from cameras and points, and our methods
-learn without depths."""
+learn without depths. `rotation` is by how much Blender turned the camera, as poses say too."""
 
 
 def unused_fields(meta: dict[str, Any]) -> list[str]:
@@ -238,9 +238,10 @@ def unused_fields(meta: dict[str, Any]) -> list[str]:
     return sorted(names - READ - NEEDLESS)
 
 
-def say_unused(meta: dict[str, Any], file: Path) -> None:
-    """One line in the log for what a scene says, or has beside it, that is not used."""
-    unused = unused_fields(meta)
+def say_unused(meta: dict[str, Any], file: Path, has_times: bool) -> None:
+    """One line in the log for what a scene says, or has beside it, that is not used; `has_times` is
+    whether its reader has taken the time of each frame."""
+    unused = [name for name in unused_fields(meta) if name != "time" or not has_times]
     folder = (file.parent / str(meta["frames"][0]["file_path"])).parent
     beside = ("dynamic_mask_*", "rays_*.dat", "*.alpha.*")
     unused += [kind for kind in beside if any(folder.glob(kind))]
@@ -318,9 +319,11 @@ def _images_option(folder: Path) -> str:
     return "" if place is None else f" --images-path {shlex.quote(str(place.relative_to(folder)))}"
 
 
-def _first_bytes(path: Path) -> bytes:
+def _begins_with(path: Path, mark: bytes) -> bool:
+    if not path.is_file():
+        return False
     with path.open("rb") as file:
-        return file.read(200)
+        return mark in file.read(200)
 
 
 def _converter_for(data: Path) -> str | None:
@@ -329,7 +332,7 @@ def _converter_for(data: Path) -> str | None:
         return None
     for sign, kind in CONVERTERS.items():
         mark = BEGIN_WITH.get(sign)
-        if any(mark is None or mark in _first_bytes(path) for path in data.glob(sign)):
+        if any(mark is None or _begins_with(path, mark) for path in data.glob(sign)):
             source = data / "images" if sign == "images" else data
             command, *options = kind.split()
             place = next((each for each in COLMAP if (data / each / "cameras.bin").is_file()), None)

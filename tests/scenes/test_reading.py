@@ -15,6 +15,7 @@ import torch
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.dnerf_dataparser import DNeRFDataParserConfig
 from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
 from nerfstudio.data.dataparsers.minimal_dataparser import MinimalDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
@@ -263,6 +264,7 @@ def test_a_photograph_is_turned_where_its_intrinsics_are_for_that(scene: Path) -
         (KeyError("w"), "add 'w' to SCENE/transforms.json"),
         (SystemExit(1), "run it on a terminal once, and answer"),
         (RuntimeError("two\nlines"), "mend SCENE/transforms.json"),
+        (ValueError("int() with base 10: '\\\\ufeff#'"), "mend SCENE/transforms.json"),
         (FileNotFoundError(2, "No", "a.dat"), "put that file there, or remove what names it"),
         (OSError("a\\b.png"), "its names were written by Windows: write / for each backslash"),
         (
@@ -335,6 +337,7 @@ def test_a_folder_of_another_reader_names_it(scene: Path, tmp_path: Path) -> Non
         ("cameras.csv", "#name,x,y", "ns-process-data realitycapture"),
         ("cameras.xml", "<?xml?>\n<document", "ns-process-data metashape"),
     ):
+        (folder / f"{name}{name[-4:]}").mkdir()  # a folder is no file of cameras
         (folder / name).write_text(begin)
         assert wanted in str(remedy_for(folder)), name
     assert remedy_for(tmp_path / "nowhere" / "at" / "all") is None
@@ -533,6 +536,44 @@ def test_pictures_of_colmap_elsewhere_are_named(scene: Path) -> None:
     (scene / "transforms.json").unlink()
     (scene / "images").rename(scene / "input")
     assert "colmap --colmap-path sparse/0 --images-path input` reads" in str(remedy_for(scene))
+
+
+def test_what_colmap_lacks_has_its_own_remedy(scene: Path) -> None:
+    config = as_colmap(scene)
+    (scene / "images").rename(scene / "input")
+    with refused(r"images/000\.png'; name the folder .*--images-path"):
+        read(config)
+    (scene / "input").rename(scene / "images")
+    of_images = scene / "sparse/0/images.txt"
+    of_images.write_text("".join(of_images.read_text().splitlines(keepends=True)[:2]))
+    with refused("; add photographs: a scene is seen from two places"):
+        read(config)
+
+
+@pytest.mark.parametrize("ending", [".png", ".JPG"])
+def test_an_ending_that_the_reader_adds_is_to_be_left_off(ending: str, scene: Path) -> None:
+    config = as_blender(scene)
+    meta = json.loads((scene / "transforms_train.json").read_text())
+    for frame in meta["frames"]:
+        frame["file_path"] += ending
+    (scene / "transforms_train.json").write_text(json.dumps(meta))
+    with refused(rf"000{ending}\.png'; blender-data adds \.png .* leave endings off$"):
+        read(config)
+
+
+@pytest.mark.filterwarnings("ignore:Starting with ImageIO:DeprecationWarning")
+@pytest.mark.parametrize("kind", [BlenderDataParserConfig, DNeRFDataParserConfig])
+def test_times_are_not_used_by_readers_without_them(
+    kind: Any, scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    as_blender(scene)
+    meta = json.loads((scene / "transforms_train.json").read_text())
+    for frame in meta["frames"]:
+        frame |= {"rotation": 0.0126, "time": 0.5}
+    (scene / "transforms_train.json").write_text(json.dumps(meta))
+    cameras = read(kind(data=scene)).cameras
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.endswith("not used: time") == (cameras.times is None) == ("not used" in said)
 
 
 def test_a_split_without_its_file_is_to_have_a_copy(scene: Path) -> None:
