@@ -14,7 +14,7 @@ import numpy as np
 from leco_plugin.evaluation.report import usable_cores
 from leco_plugin.log import bar, resumable
 from leco_plugin.scenes.input_error import InputError, require
-from leco_plugin.scenes.locks import LOCK, alone_in
+from leco_plugin.scenes.locks import alone_in
 from leco_plugin.scenes.poses import ASKED
 from leco_plugin.scenes.poses import georeference as world
 from leco_plugin.scenes.poses.georeference import MODEL, POINTS, Placement, points_of, poses_of
@@ -124,7 +124,8 @@ def _finished(out: Path, asked: dict[str, Any]) -> dict[str, Any] | None:
     folder holds something else."""
     found = _read(out / ASKED)
     if found is None:
-        if out.exists() and (not out.is_dir() or {each.name for each in out.iterdir()} - {LOCK}):
+        # a full disk leaves folders without a file, and others' programs hidden files
+        if out.is_file() or any(path.is_file() and path.name[0] != "." for path in out.rglob("*")):
             raise InputError(f"--out {out} holds something else: give another folder")
         return None
     other = [name for name in asked if name != GPS and found.get(name) != asked[name]]

@@ -87,7 +87,8 @@ def _position(gps: Mapping[int, Any]) -> Position | None:
     if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0) or latitude == longitude == 0.0:
         return None
     altitude = _number(gps.get(ExifTags.GPS.GPSAltitude, math.nan), math.nan)
-    below = gps.get(ExifTags.GPS.GPSAltitudeRef) in (1, b"\x01")
+    # below the sea or, since EXIF 3, below the ellipsoid
+    below = gps.get(ExifTags.GPS.GPSAltitudeRef) in (1, 3, b"\x01", b"\x03")
     return latitude, longitude, -altitude if below else altitude
 
 
@@ -204,14 +205,17 @@ def find_photographs(folder: Path, out: Path) -> Found:
         raise InputError(f"there is no folder {folder}: give the one with the photographs")
     if folder.is_relative_to(out):
         raise InputError(f"--out {out} holds the photographs: give a folder beside them")
-    files = _files_below(folder, out)
+    refused: dict[Path, str] = {}
+    files = _files_below(folder, out, refused)
     found = [path for path in files if path.suffix.lower() in KINDS]
     if len(found) < FEWEST:
         number = counted(len(found), "photograph") if found else "no photographs"
         raw = sum(path.suffix.lower() in RAW for path in files)
         films = sum(path.suffix.lower() in FILMS for path in files)
         remedy = "take more, from different places, whose pictures overlap by two thirds"
-        if raw:
+        if refused:
+            remedy = f"{next(iter(refused.values()))}: give yourself the right to read it"
+        elif raw:
             some = counted(raw, "raw file is", "raw files are")
             remedy = f"{some} not read, save {by_number(raw, 'it', 'them')} as JPEG"
         elif films:
@@ -224,7 +228,6 @@ def find_photographs(folder: Path, out: Path) -> Found:
         raise InputError(f"{folder} has {number}, and {FEWEST} or more are needed: {remedy}")
     with suppress(ImportError):
         import_module("pillow_heif").register_heif_opener()
-    refused: dict[Path, str] = {}
     photographs = [each for path in found if (each := _or_why(_read, path, folder, refused))]
     clear = [each.path for each in photographs if each.header.transparent]
     if clear and len(clear) < len(photographs):
@@ -240,13 +243,18 @@ def find_photographs(folder: Path, out: Path) -> Found:
     return _enough(Found(photographs, refused))
 
 
-def _files_below(folder: Path, out: Path) -> list[Path]:
-    """Files in a folder and below it, by name, each folder once; none hidden, and none in `out`."""
+def _files_below(folder: Path, out: Path, refused: dict[Path, str]) -> list[Path]:
+    """Files in a folder and below it, by name, each folder once; none hidden, and none in `out`.
+    Links that lead nowhere count too, and folders that cannot be read are noted in `refused`."""
+
+    def note(error: OSError) -> None:
+        refused[Path(error.filename)] = f"{error.filename} cannot be read ({error.strerror})"
+
     found: list[Path] = []
     known = set()
     starts = [folder]  # linked folders follow, so that a folder is known by its own name first
     for start in starts:
-        for place, folders, names in os.walk(start):
+        for place, folders, names in os.walk(start, onerror=note):
             here, real = Path(place), Path(place).resolve()
             # thumbnails and previews of other programs lie in hidden folders
             folders[:] = sorted(name for name in folders if name[0] != ".")
@@ -256,7 +264,7 @@ def _files_below(folder: Path, out: Path) -> list[Path]:
             known.add(real)
             starts += [here / name for name in folders if (here / name).is_symlink()]
             found += [here / name for name in names if name[0] != "."]
-    return sorted(path for path in found if path.is_file())
+    return sorted(path for path in found if os.path.isfile(path) or not os.path.exists(path))
 
 
 def _enough(found: Found) -> Found:

@@ -27,6 +27,7 @@ from leco_plugin import cli
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.locks import alone_in
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
+from leco_plugin.scenes.poses import command
 from leco_plugin.scenes.poses.command import _report, make_scene, summary
 from leco_plugin.scenes.poses.georeference import Placement
 
@@ -234,6 +235,20 @@ def test_of_two_blocks_the_largest_is_written_and_wrong_gps_is_not_used(
     meta = meta_of(out)
     assert not {"metres_per_unit", "geographic_origin"} & {*meta}
     assert min(frame["transform_matrix"][2][2] for frame in meta["frames"]) > 0.9
+
+
+def test_a_folder_that_a_full_disk_left_without_files_can_be_used(
+    pycolmap: Any, photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(command, "write_json", fail)
+    for _ in range(2):
+        with pytest.raises(OSError, match="No space left"):
+            make_scene(photos, tmp_path / "out")
+        (tmp_path / "out" / "colmap").mkdir(exist_ok=True)
+        (tmp_path / "out" / ".DS_Store").touch()
 
 
 def test_a_folder_with_something_else_is_refused_before_any_work(

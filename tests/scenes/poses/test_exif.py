@@ -52,6 +52,14 @@ def test_a_position_is_of_the_globe_or_none(
         assert found[:2] == pytest.approx(wanted) and math.isnan(found[2])
 
 
+@pytest.mark.parametrize(("reference", "sign"), [(0, 1), (1, -1), (2, 1), (3, -1)])
+def test_altitudes_below_the_sea_and_the_ellipsoid_are_negative(reference: int, sign: int) -> None:
+    exif = exif_of((0.0, 0.0, 9.0))
+    exif[0x8825][5] = bytes([reference])
+    found = read(exif).position
+    assert found is not None and found[2] == 9.0 * sign
+
+
 @pytest.mark.parametrize(
     ("parts", "reference"),
     [

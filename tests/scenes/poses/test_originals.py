@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import warnings
 from pathlib import Path
@@ -160,6 +161,28 @@ def test_photographs_in_linked_folders_are_found_once(folder: Path, tmp_path: Pa
     assert names == ["IMG_0.jpg", "day_IMG_2.jpg", "z_IMG_1.jpg"]
 
 
+def test_what_a_link_or_a_closed_folder_hides_is_named(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / "IMG_3.jpg").symlink_to(tmp_path / "gone.jpg")
+    (folder / "closed").mkdir()
+    scan = os.scandir
+
+    def refuse(place: str) -> object:
+        if Path(place).name == "closed":
+            raise PermissionError(13, "Permission denied", place)
+        return scan(place)
+
+    monkeypatch.setattr(os, "scandir", refuse)
+    found = find_photographs(folder, tmp_path / "out")
+    assert len(found.photographs) == 3
+    said = {path.name: line for path, line in found.refused.items()}
+    assert "it is a link to" in said["IMG_3.jpg"] and "Permission denied" in said["closed"]
+    folder.rename(tmp_path / "closed")
+    with pytest.raises(InputError, match=r"no photographs, .*closed cannot be read .*the right to"):
+        find_photographs(tmp_path / "closed", tmp_path / "out")
+
+
 def test_photographs_of_one_lens_and_size_share_it(folder: Path, tmp_path: Path) -> None:
     with Image.open(folder / "IMG_0.jpg") as image:
         image.crop((0, 0, 20, 20)).save(folder / "IMG_3.jpg")
@@ -214,6 +237,13 @@ def test_long_names_of_folders_are_cut_to_what_a_file_may_have(
     names = sorted(copies(folder, tmp_path / "out"))
     assert [name[-9:] for name in names] == ["IMG_2.jpg", "IMG_0.jpg", "IMG_1.jpg"]
     assert len(names[1]) <= 80
+
+
+def test_the_longest_name_in_letters_of_three_bytes_is_written(
+    folder: Path, tmp_path: Path
+) -> None:
+    (folder / "IMG_0.jpg").rename(folder / ("\u6d77" * 80 + ".jpg"))
+    assert max(map(len, copies(folder, tmp_path / "out"))) == 80
 
 
 def test_a_copy_that_cannot_be_written_ends_the_work(folder: Path, tmp_path: Path) -> None:
