@@ -7,9 +7,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from nerfstudio.cameras.cameras import CameraType
 from numpy.typing import NDArray
 
 from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.lenses import lens_of
+from leco_plugin.scenes.photograph_files import find_file
 from leco_plugin.scenes.scene_file import file_in, load_json
 
 CONFIG = "config.yml"
@@ -107,7 +110,7 @@ def coloured_points(description: Path) -> ColouredPoints | None:
     """Sparse points with colours that a transforms.json names, or None. InputError if they cannot
     be read."""
     name = load_json(description).get("ply_file_path")
-    path = description.parent / str(name)
+    path = find_file(description.parent / str(name))
     if name is None or not path.is_file():
         return None
     positions, colours = read_cloud(path)
@@ -136,8 +139,6 @@ def camera_places(description: Path) -> NDArray[np.float64]:
 
 WIDER = 0.02
 """Share of its size by which an image counts as wider: no lens is known better."""
-PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
-"""Camera models whose images show what lies before them."""
 
 
 def views_of(description: Path, places: NDArray[np.float64]) -> NDArray[np.int64] | None:
@@ -147,21 +148,23 @@ def views_of(description: Path, places: NDArray[np.float64]) -> NDArray[np.int64
     counts = np.zeros(len(places), dtype=np.int64)
     try:
         for frame in meta["frames"]:
-            lens = {**meta, **frame}
-            if lens.get("camera_model", PINHOLES[0]) not in PINHOLES:
-                return None
-            size = np.array([lens["w"], lens["h"]], dtype=np.float64)
-            focal = np.array([lens["fl_x"], lens.get("fl_y", lens["fl_x"])], dtype=np.float64)
-            centre = np.array([lens.get("cx", size[0] / 2), lens.get("cy", size[1] / 2)])
+            lens = lens_of(meta, frame, str(description))
             pose = np.array(frame["transform_matrix"], dtype=np.float64)
-            if not all(np.isfinite(part).all() for part in (size, focal, centre, pose)):
+            is_known = (lens.fx or lens.angle_x) is not None and np.isfinite(pose).all()
+            if not is_known or lens.kind not in (None, CameraType.PERSPECTIVE):
                 return None
+            if lens.width is None or lens.height is None:
+                return None
+            size = np.array([lens.width, lens.height])
+            focal = np.array(lens.focal_lengths(lens.width, lens.height, 1), dtype=np.float64)
+            centre = size / 2 if lens.cx is None or lens.cy is None else [lens.cx, lens.cy]
+            k1, k2, *_ = lens.distortion or (0.0, 0.0)
             local = (places - pose[:3, 3]) @ pose[:3, :3]
             ahead = -local[:, 2]
             with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
                 slopes = local[:, :2] * [1.0, -1.0] / ahead[:, None]
-                bent, folded = _bend(slopes, lens.get("k1", 0.0), lens.get("k2", 0.0))
-                pixels = centre + focal * bent
+                bent, folded = _bend(slopes, k1, k2)
+                pixels = np.add(centre, focal * bent)
             inside = (pixels >= -WIDER * size) & (pixels <= (1.0 + WIDER) * size)
             counts += inside.all(axis=1) & (ahead > 0.0) & ~folded
     except (KeyError, TypeError, ValueError, IndexError):

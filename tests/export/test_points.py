@@ -97,8 +97,20 @@ def test_photographs_show_what_lies_before_them_within_their_images(tmp_path: Pa
     # a barrel draws in what lies outside: 2.3 / 2 -> 1.15 (1 - 0.2 * 1.32) = 0.85
     barrel = views_of(scene_of(tmp_path, (0.0, 0.0, 2.0), k1=-0.2), places)
     assert barrel is not None and barrel.tolist() == [1, 1, 1, 1, 0, 0, 0]  # 4 / 2: folded
-    for lens in ({"camera_model": "OPENCV_FISHEYE"}, {"fl_x": None}, {"w": "wide"}):
+    unknown: list[dict[str, object]] = [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}]
+    for lens in (*unknown, {"fl_x": None}, {"w": "wide"}):
         assert views_of(scene_of(tmp_path, far, **lens), places) is None
+
+
+def test_what_photographs_show_is_known_by_each_way_to_say_a_lens(tmp_path: Path) -> None:
+    places = np.array([[0, 0, 0], [1.9, 0, 0], [2.3, 0, 0], [0, 0.9, 0], [0, 1.2, 0]])
+    no_focal = {"fl_x": None, "fl_y": None, "cx": None, "cy": None}
+    for said in ({"x_fov": 90.0}, {"camera_angle_x": np.pi / 2}):
+        angle = views_of(scene_of(tmp_path, (0.0, 0.0, 2.0), **no_focal, **said), places)
+        assert angle is not None and angle.tolist() == [1, 1, 0, 1, 0]
+    listed = {"distortion_params": [-0.2, 0.0, 0.0, 0.0, 0.0, 0.0]}
+    barrel = views_of(scene_of(tmp_path, (0.0, 0.0, 2.0), **listed), places)
+    assert barrel is not None and barrel.tolist() == [1, 1, 1, 1, 0]
 
 
 def test_points_that_no_two_photographs_show_are_left_out(tmp_path: Path) -> None:

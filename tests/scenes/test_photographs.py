@@ -16,7 +16,7 @@ import trimesh
 from PIL import Image
 from scene_files import change, refused
 
-from leco_plugin.scenes.coloured_points import read_cloud
+from leco_plugin.scenes.coloured_points import coloured_points, read_cloud
 from leco_plugin.scenes.frames import METRES_PER_UNIT, data_frame_of, inverse, moved, parsed_frame
 from leco_plugin.scenes.photographs import (
     POINTS,
@@ -26,6 +26,8 @@ from leco_plugin.scenes.photographs import (
     read_scene,
     taken_from_above,
 )
+from leco_plugin.scenes.poses.georeference import write_sparse_points
+from leco_plugin.scenes.poses.points import find_points
 from leco_plugin.scenes.whole_files import write_points
 
 LISTS = ("train_filenames", "val_filenames", "test_filenames")
@@ -337,3 +339,14 @@ def test_splatfacto_starts_from_the_sparse_points_and_their_colours(scene: Path)
     assert torch.allclose(places, expected.float(), atol=1e-5)
     assert colours.dtype == torch.uint8 and colours.tolist() == rows["rgb"].tolist()
     assert manager.next_train(0)[1]["image"].shape == (32, 32, 3)
+
+
+def test_coloured_points_are_found_under_a_name_as_windows_writes_it(scene: Path) -> None:
+    (scene / "sparse").mkdir()
+    places = np.random.default_rng(0).random((40, 3))
+    write_sparse_points(scene / "sparse" / "points.ply", places, np.full((40, 3), 9, np.uint8))
+    change(scene, lambda meta: meta.update(ply_file_path="sparse\\points.ply"))
+    found = coloured_points(scene / "transforms.json")
+    assert found is not None and len(found.positions) == 40
+    report = find_points(scene)
+    assert not report["done"] and Path(report["file"]).is_file()

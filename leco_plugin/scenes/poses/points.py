@@ -60,7 +60,7 @@ def find_points(data: Path, size: int = 1600, threads: int = 0) -> dict[str, Any
     report: dict[str, Any] = {"format": 1, "photographs": len(chosen)}
     known = read_points(scene.meta, scene.folder)
     if known is not None and len(known.positions) >= FEWEST_POINTS:
-        there = scene.folder / scene.meta["ply_file_path"]
+        there = find_file(scene.folder / scene.meta["ply_file_path"])
         return report | {"points": len(known.positions), "file": str(there), "done": False}
     if len(chosen) < FEWEST:
         few = counted(len(chosen), "photograph")
