@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.lenses import lens_of
 from leco_plugin.scenes.photograph_files import find_file
-from leco_plugin.scenes.scene_file import file_in, load_json
+from leco_plugin.scenes.scene_file import file_in, load_json, poses_in
 
 CONFIG = "config.yml"
 NEAREST = 3
@@ -130,9 +130,7 @@ def colours_near(known: ColouredPoints, positions: NDArray[np.float64]) -> NDArr
 def camera_places(description: Path) -> NDArray[np.float64]:
     """Places [C, 3] of the cameras in a transforms.json; [0, 3] where they are no poses."""
     try:
-        frames = load_json(description)["frames"]
-        poses = np.array([frame["transform_matrix"] for frame in frames], dtype=np.float64)
-        return poses.reshape(-1, 4, 4)[:, :3, 3]
+        return poses_in(load_json(description)["frames"]).reshape(-1, 4, 4)[:, :3, 3]
     except (KeyError, TypeError, ValueError):
         return np.zeros((0, 3))
 

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from leco_plugin.log import say
 from leco_plugin.scenes.frames import APPLIED, applied_in, inverse, moved, parsed_frame
-from leco_plugin.scenes.scene_file import load_json
+from leco_plugin.scenes.scene_file import load_json, poses_in
 
 FAR = 100.0
 """Times the cameras' spread. Nearer to the origin float32 rounds to less than 1e-5 of it."""
@@ -101,7 +101,7 @@ class ReadsNear(DataParser):
     def _near(self, meta: dict[str, Any]) -> dict[str, Any]:
         """What a file says, its poses shifted by what the first file shows to be far."""
         try:
-            poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], dtype=float)
+            poses = poses_in(meta["frames"])
             positions = poses[:, :3, 3]
         except (KeyError, TypeError, ValueError, IndexError):
             return meta  # no poses, or none that any reader takes

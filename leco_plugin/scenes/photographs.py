@@ -31,7 +31,7 @@ from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.large_coordinates import ReadsNear
 from leco_plugin.scenes.photograph_files import check_images, find_file
 from leco_plugin.scenes.reading import CheckedReader
-from leco_plugin.scenes.scene_file import SceneFile, file_in, load_json, scene_file_of
+from leco_plugin.scenes.scene_file import SceneFile, file_in, load_json, poses_in, scene_file_of
 
 COLOURS = "points3D_rgb"
 """That of their colours, uint8 [P, 3]. nerfstudio's pipelines want both or neither."""
@@ -111,8 +111,8 @@ class LecoPhotographs(CheckedReader, ReadsNear, Nerfstudio):
         """Whether z is up in the file already: it says so, or its cameras look down along it."""
         if "orientation_override" in meta:
             return bool(meta["orientation_override"] == "none")
-        poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], dtype=float)
-        return self.config.orientation_method in ("up", "none") and taken_from_above(poses)
+        is_free = self.config.orientation_method in ("up", "none")
+        return is_free and taken_from_above(poses_in(meta["frames"]))
 
 
 def folder_of(data: Path) -> Path:
@@ -239,9 +239,8 @@ def _grow(positions: Array) -> tuple[NDArray[np.int64], Array]:
 def stretch_of(meta: dict[str, Any], scene: str) -> dict[str, list[str]]:
     """Names of the photographs of a transforms.json: `train`, `test`, and `beside`, left out as
     they stand next to the tested ones. InputError, with `scene`, if no stretch can be held out."""
-    poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], dtype=float)
     try:
-        held_out, beside = find_stretch(poses[:, :3, 3])
+        held_out, beside = find_stretch(poses_in(meta["frames"])[:, :3, 3])
     except ValueError as error:
         raise InputError(f"{scene}: {error}; hold out photographs of the spread instead") from None
     kinds = dict.fromkeys(held_out, "test") | dict.fromkeys(beside, "beside")

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from nerfstudio.cameras.cameras import Cameras
+from numpy.typing import NDArray
 
 from leco_plugin.log import by_number, say
 from leco_plugin.scenes.frames import check_poses
@@ -94,6 +95,11 @@ def _completed(frame: Any) -> Any:
     return frame
 
 
+def poses_in(frames: list[dict[str, Any]]) -> NDArray[np.float64]:
+    """The poses [C, 4, 4] of frames; ValueError, KeyError or TypeError where they have none."""
+    return np.array([frame["transform_matrix"] for frame in frames], dtype=float)
+
+
 def read_scene_file(path: Path, split: str, folder: Path) -> SceneFile:
     """A transforms.json, its pictures relative to `folder`. InputError if its poses or lenses are
     none that cameras have, or all cameras of a training split are in one place."""
@@ -104,7 +110,7 @@ def read_scene_file(path: Path, split: str, folder: Path) -> SceneFile:
         names = [frame["file_path"] for frame in frames]
         if not all(type(name) is str and all(ord(c) >= 32 for c in name) for name in names):
             raise ValueError("a file_path is no path")
-        poses = np.array([frame["transform_matrix"] for frame in frames], dtype=float)
+        poses = poses_in(frames)
     except NO_SCENE as error:
         reason = f"{type(error).__name__}: {one_line(error, 120)}"
         fault = f"is not a scene in nerfstudio's format ({reason}); mend it, or"

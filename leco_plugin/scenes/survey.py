@@ -137,8 +137,6 @@ def survey(
     dataset = datamanager.train_dataset
     config = with_known_altitudes(config, getattr(dataset, "metadata", {}) or {})
     cameras: Cameras = dataset.cameras
-    if len(cameras) == 0:
-        raise InputError("the scene has no training cameras")
     origins, directions = covering_rays(cameras)
     chosen = chosen_cameras(len(cameras))
     poses = cameras.camera_to_worlds[chosen]
@@ -184,7 +182,9 @@ def covering_rays(
     cameras: Cameras, side: int = SIDE, most: int = MOST_CAMERAS
 ) -> tuple[Tensor, Tensor]:
     """Rays, `side` along each side of an image, of up to `most` cameras: origins and unit
-    directions, [C, side * side, 3] float32 on the CPU."""
+    directions, [C, side * side, 3] float32 on the CPU. InputError if there are no cameras."""
+    if len(cameras) == 0:
+        raise InputError("the scene has no training cameras")
     cameras = cameras.to("cpu")
     chosen = chosen_cameras(len(cameras), most)
     sizes = torch.cat([cameras.height, cameras.width], dim=1)[chosen].float() - 1.0
@@ -248,12 +248,10 @@ def detail_of(
 ) -> SceneDetail:
     """The size of the scene that these cameras see, by sparse points [P, 3] if there are any.
     InputError if there are no cameras, none sees a point, or what is configured is no range."""
-    if len(cameras) == 0:
-        raise InputError("the scene has no training cameras")
     cameras = cameras.to("cpu")
+    origins, directions = covering_rays(cameras)
     chosen = chosen_cameras(len(cameras))
     poses = cameras.camera_to_worlds[chosen].float()
-    origins, directions = covering_rays(cameras)
     bounds = find_bounds(poses, directions, points, config)
     places = _places(points, origins, directions, bounds)
     density = torch.zeros(len(places))

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from leco_plugin.scenes.city.cameras import Lens
+from leco_plugin.scenes.city.cameras import QUINCUNX, Lens
 
 Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
@@ -21,8 +21,6 @@ _TINY = 1e-9
 _SUN = np.array([0.48, -0.36, 0.8])
 _SHADE = 0.45
 """Light where the sun does not reach."""
-_QUINCUNX = ((0.5, 0.5), (0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75))
-"""Places in a pixel that rays go through. The first gives the depth, all give the colour."""
 _FOG_STEPS = 32
 _HORIZON, _ZENITH = np.array([0.86, 0.90, 0.94]), np.array([0.35, 0.55, 0.86])
 
@@ -184,11 +182,11 @@ def photograph(stage: Stage, camera_to_world: Array, lens: Lens) -> Seen:
     """Takes one antialiased picture from a pose [3, 4], metres, OpenGL axes."""
     size = lens.height, lens.width
     total, detail, depth = np.zeros((*size, 4)), np.zeros(size, bool), np.zeros(size)
-    for number, place in enumerate(_QUINCUNX):
+    for number, place in enumerate(QUINCUNX):
         directions = (lens.directions(place) @ camera_to_world[:, :3].T).reshape(-1, 3)
         origins = np.broadcast_to(camera_to_world[:, 3], directions.shape)
         colours, depths, is_detail = look(stage, origins, directions)
-        total += colours.reshape(*size, 4) / len(_QUINCUNX)
+        total += colours.reshape(*size, 4) / len(QUINCUNX)
         detail |= is_detail.reshape(size)
         if number == 0:
             depth = depths.reshape(size)

@@ -16,6 +16,8 @@ from leco_plugin.scenes.city.city import City
 from leco_plugin.scenes.city.shapes import Array
 
 EYE_HEIGHT = 2.0
+QUINCUNX = ((0.5, 0.5), (0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75))
+"""Places in a pixel that rays go through. The first gives the depth, all give the colour."""
 _AHEAD = 0.6
 """How many blocks ahead of a street camera there must still be city."""
 _CLEARANCE = 0.7

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from leco_plugin.scenes.city.cameras import Lens
+from leco_plugin.scenes.city.cameras import QUINCUNX, Lens
 from leco_plugin.scenes.city.city import City
 from leco_plugin.scenes.city.shapes import STOREY, Array, Material
 
@@ -155,8 +155,6 @@ _GAMMA = 1.5
 """Brightens shadows; less than a screen's 2.2, which would bleach this much light."""
 _RAYS = 1 << 18
 """Rays cast at once, to bound the memory of large pictures."""
-_QUINCUNX = ((0.5, 0.5), (0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75))
-"""Places in a pixel that rays go through. The first gives the depth, all give the colour."""
 
 
 class Tracer:
@@ -225,13 +223,13 @@ class Tracer:
         """
         size = lens.height, lens.width
         image, depth = np.zeros((*size, 3), np.float32), np.zeros(size, np.float32)
-        for number, place in enumerate(_QUINCUNX):
+        for number, place in enumerate(QUINCUNX):
             directions = lens.directions(place) @ camera_to_world[:, :3].T
             for rows in np.array_split(np.arange(lens.height), -(-depth.size // _RAYS)):
                 rays = directions[rows].reshape(-1, 3)
                 origins = np.broadcast_to(camera_to_world[:, 3], rays.shape)
                 colours, depths = self.colour(origins, rays, 1 / lens.focal)
-                image[rows] += colours.reshape(len(rows), -1, 3) / len(_QUINCUNX)
+                image[rows] += colours.reshape(len(rows), -1, 3) / len(QUINCUNX)
                 if number == 0:
                     depth[rows] = depths.reshape(len(rows), -1)
         return np.rint(255 * image ** np.float32(1 / _GAMMA)).astype(np.uint8), depth

@@ -176,11 +176,10 @@ class KnownDistancePixelSampler(HeldOutPixelSampler):
         if self.set_aside is not None:
             loaded &= ~self.set_aside[pixels[:, 0]]
         drawn, pixels, places = drawn[loaded], pixels[loaded], places[loaded]
-        inside = self.shown(pixels, sizes_of(images["image"])[places])
-        drawn, pixels, places = drawn[inside], pixels[inside], places[inside]
+        seen = self.shown(pixels, sizes_of(images["image"])[places])
         if "mask" in images:
-            seen = look_up(images["mask"], places, pixels[:, 1:]).flatten(1).all(dim=1).cpu()
-            drawn, pixels, places = drawn[seen], pixels[seen], places[seen]
+            seen &= look_up(images["mask"], places, pixels[:, 1:]).flatten(1).all(dim=1).cpu()
+        drawn, pixels, places = drawn[seen], pixels[seen], places[seen]
         known = batch["image"].new_zeros(len(batch["indices"]), dtype=torch.float32)
         known[: len(drawn)] = sparse.distances[drawn].to(known.device)
         for key, source in images.items():

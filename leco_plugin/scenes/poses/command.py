@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from leco_plugin.evaluation.report import usable_cores
 from leco_plugin.log import bar, resumable
-from leco_plugin.scenes.input_error import InputError, require
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.locks import alone_in
 from leco_plugin.scenes.poses import ASKED
 from leco_plugin.scenes.poses import georeference as world
@@ -24,6 +23,7 @@ from leco_plugin.scenes.poses.reconstruction import (
     MODELS,
     Lens,
     Reconstructor,
+    check_options,
     choose_pairs,
     load_pycolmap,
     require_disk,
@@ -55,8 +55,7 @@ def make_scene(
     Features are looked for at a longest side of `size` pixels; 0 threads are all. InputError if
     `out` holds something else, or the photographs cannot be used; ImportError without pycolmap.
     """
-    require(size >= 100, "size", size, "100 pixels or more")
-    require(threads >= 0, "threads", threads, "0 for all, or a number of them")
+    check_options(size, threads)
     pycolmap = load_pycolmap()
     folder, out, began = folder.resolve(), out.resolve(), time.monotonic()
     found = find_photographs(folder, out)
@@ -81,7 +80,7 @@ def make_scene(
         exifs = [each.exif for each in photographs]
         origin, places = world.local_places(pycolmap, [exif.position for exif in exifs])
         chosen = choose_pairs([each.name for each in photographs], exifs, places)
-        work = Reconstructor(out, photographs, threads or usable_cores())
+        work = Reconstructor(out, photographs, threads)
         work.extract(lens, size)
         work.match(chosen)
         models = work.map()

@@ -14,10 +14,9 @@ from nerfstudio.cameras.cameras import CameraType
 from numpy.typing import NDArray
 from PIL import Image
 
-from leco_plugin.evaluation.report import usable_cores
 from leco_plugin.log import bar, counted
 from leco_plugin.scenes.bounds import FEWEST_POINTS
-from leco_plugin.scenes.input_error import InputError, require
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.lenses import DISTORTIONS, MIXED, Lens
 from leco_plugin.scenes.photograph_files import decode, find_file, header_of, is_turned, seen_pixels
 from leco_plugin.scenes.photographs import read_points, read_scene
@@ -26,11 +25,12 @@ from leco_plugin.scenes.poses.originals import FEWEST, Exif, Photograph
 from leco_plugin.scenes.poses.reconstruction import (
     MASKS,
     Reconstructor,
+    check_options,
     choose_posed_pairs,
     load_pycolmap,
     require_disk,
 )
-from leco_plugin.scenes.scene_file import SceneFile
+from leco_plugin.scenes.scene_file import SceneFile, poses_in
 from leco_plugin.scenes.whole_files import check_place, write_json, write_whole
 
 Array = NDArray[np.float64]
@@ -53,8 +53,7 @@ def find_points(data: Path, size: int = 1600, threads: int = 0) -> dict[str, Any
     at a longest side of `size` pixels; 0 threads are all. InputError if the scene cannot be read,
     or no points are found; ImportError without pycolmap.
     """
-    require(size >= 100, "size", size, "100 pixels or more")
-    require(threads >= 0, "threads", threads, "0 for all, or a number of them")
+    check_options(size, threads)
     scene = read_scene(data)
     chosen = training_frames(scene)
     report: dict[str, Any] = {"format": 1, "photographs": len(chosen)}
@@ -67,7 +66,7 @@ def find_points(data: Path, size: int = 1600, threads: int = 0) -> dict[str, Any
         raise InputError(f"{scene.path} has {few}; {FEWEST} or more are needed")
     load_pycolmap()
     check_place("--data", scene.path.with_name(FILE))
-    poses = np.array([scene.frames[number]["transform_matrix"] for number in chosen])[:, :3]
+    poses = poses_in(scene.frames)[chosen, :3]
     centre = poses[:, :, 3].mean(axis=0)  # pycolmap loses digits of coordinates like UTM's
     poses[:, :, 3] -= centre
     with tempfile.TemporaryDirectory() as work:
@@ -76,7 +75,7 @@ def find_points(data: Path, size: int = 1600, threads: int = 0) -> dict[str, Any
         copies = sum(BYTES_A_SQUARE * side**2 for side in sides)
         require_disk(Path(work), len(chosen), copies, "TMPDIR")
         photographs, cameras = _copies(scene, chosen, Path(work) / "images", size)
-        reconstructor = Reconstructor(Path(work), photographs, threads or usable_cores())
+        reconstructor = Reconstructor(Path(work), photographs, threads)
         reconstructor.folder.mkdir()
         reconstructor.extract("perspective", size)
         model = _triangulate(reconstructor, cameras, poses)

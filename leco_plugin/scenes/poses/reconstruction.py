@@ -18,8 +18,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from leco_plugin.evaluation.report import usable_cores
 from leco_plugin.log import bar, counted
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, require
 from leco_plugin.scenes.poses.originals import FEWEST, Exif, Photograph
 
 Lens = Literal["perspective", "fisheye"]
@@ -54,14 +55,21 @@ def load_pycolmap() -> Any:
     return pycolmap
 
 
+def check_options(size: int, threads: int) -> None:
+    """InputError unless features can be looked for at that size, by so many threads."""
+    require(size >= 100, "size", size, "100 pixels or more")
+    require(threads >= 0, "threads", threads, "0 for all, or a number of them")
+
+
 class Reconstructor:
     """pycolmap on the photographs of a scene."""
 
     def __init__(self, scene: Path, photographs: Sequence[Photograph], threads: int) -> None:
-        """With the folder of the scene, whose `images` has all copies, and MASKS some masks."""
+        """With the folder of the scene, whose `images` has all copies, and MASKS some masks; 0
+        threads are all."""
         self.pycolmap, self.scene, self.images = load_pycolmap(), scene, scene / "images"
         self.folder, self.database = scene / "colmap", scene / DATABASE
-        self.photographs, self.threads = photographs, threads
+        self.photographs, self.threads = photographs, threads or usable_cores()
 
     def extract(self, lens: Lens, size: int) -> None:
         """Finds features, at a longest side of `size` pixels, in photographs that have none yet."""
