@@ -14,6 +14,7 @@ from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.lenses import lens_of
 from leco_plugin.scenes.photograph_files import find_file
 from leco_plugin.scenes.scene_file import file_in, load_json, poses_in
+from leco_plugin.scenes.whole_files import FETCH, is_pointer
 
 CONFIG = "config.yml"
 NEAREST = 3
@@ -89,6 +90,8 @@ def read_cloud(path: Path) -> CloudFile:
     import trimesh
 
     try:
+        if is_pointer(path):
+            raise ValueError(f"it {FETCH}")
         # as a file and not by its name: nothing else is read that it may point to
         with path.open("rb") as file:
             loaded: Any = trimesh.load(file, file_type="ply", process=False)

@@ -23,7 +23,7 @@ from PIL import ExifTags, Image
 
 from leco_plugin.log import by_number, counted, say
 from leco_plugin.scenes.input_error import InputError, one_line
-from leco_plugin.scenes.whole_files import LONGEST, write_whole
+from leco_plugin.scenes.whole_files import FETCH, LONGEST, is_pointer, write_whole
 
 READ_RIGHTLY = ("L", "RGB", "RGBA")
 """Pillow's modes of images that nerfstudio reads as they are."""
@@ -86,6 +86,8 @@ def header_of(path: Path) -> Header:
     except (OSError, ValueError, EOFError, SyntaxError):
         if not os.path.exists(path):
             raise InputError(f"the image {path} is not there{remedy_for_missing(path)}") from None
+        if path.is_file() and is_pointer(path):
+            raise InputError(f"{path} {FETCH}") from None
         raise InputError(f"{path} cannot be read as an image: {SAVE_ANEW}") from None
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 
 from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.whole_files import FETCH, is_pointer
 
 MOST_RECORDS, LONGEST_PICKLE = 256, 1 << 14
 """Records of an archive, and bytes of its pickle: that of a picture's metadata has about 500."""
@@ -33,6 +34,8 @@ def read_bytes(path: Path, most_bytes: int) -> bytes:
     try:
         if not path.is_file():
             raise InputError(f"there is no file {path}")
+        if is_pointer(path):
+            raise InputError(f"{path} {FETCH}")
         size = path.stat().st_size
         if size > most_bytes:
             raise InputError(f"{path} has {size} bytes, and needs no more than {most_bytes}")

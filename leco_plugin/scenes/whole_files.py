@@ -17,6 +17,9 @@ PART = ".part"
 """How the names of unfinished files end."""
 LONGEST = 40
 """Letters of a name that an unfinished file has too: of 255 bytes each takes up to 4."""
+POINTER = b"version https://git-lfs"
+FETCH = "is a pointer of Git LFS: `git lfs pull` fetches the file"
+"""What to say of a file that `is_pointer`."""
 PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar"}
 
 
@@ -32,6 +35,12 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def is_pointer(path: Path) -> bool:
+    """Whether a file only says where Git LFS has what belongs there."""
+    with path.open("rb") as file:
+        return file.read(len(POINTER)) == POINTER
 
 
 def write_json(path: Path, value: Any, indent: int = 2, allow_nan: bool = False) -> None:

@@ -1,10 +1,15 @@
 """A file under its name is whole, whatever happens to the process that writes it."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
 import pytest
+from scene_files import refused
 
+from leco_plugin.scenes.coloured_points import read_cloud
+from leco_plugin.scenes.photograph_files import header_of
+from leco_plugin.scenes.pt_file import read_pt
 from leco_plugin.scenes.whole_files import PART, remove_parts, write_whole
 
 
@@ -41,3 +46,13 @@ def test_parts_of_killed_processes_are_found_at_any_depth(tmp_path: Path) -> Non
     (tmp_path / "a" / "picture.png").write_bytes(b"")
     remove_parts(tmp_path)
     assert [p.name for p in tmp_path.rglob("*") if p.is_file()] == ["picture.png"]
+
+
+@pytest.mark.parametrize("read", [header_of, read_cloud, read_pt])
+def test_what_git_lfs_has_not_fetched_is_named(
+    read: Callable[[Path], object], tmp_path: Path
+) -> None:
+    path = tmp_path / "0.jpg"
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
+    with refused(r"0\.jpg .*is a pointer of Git LFS: `git lfs pull` fetches the file$"):
+        read(path)
