@@ -83,6 +83,10 @@ class LecoDataManager(Vanilla):  # type: ignore[type-arg]
             say(read_in_words(self.get_datapath(), self.train_dataset, len(dataset)))
             if len(dataset) == 0:
                 say(f"no test image: the run trains on all {count} and evaluates nothing")
+            both = len({*dataset.image_filenames} & {*self.train_dataset.image_filenames})
+            if both > 0:
+                some = counted(both, "test photograph is", "test photographs are")
+                say(f"{some} trained on too: their scores say nothing of new views")
         if len(dataset) == 0:
             lack = f"{self.get_datapath()} has no test image in this run, and nothing can be"
             none: Any = NoTestImages(f"{lack} evaluated; ns-render shows what it has learned")

@@ -273,6 +273,17 @@ def test_beside_fisheyes_perspective_photographs_are_read_as_a_whole(
     assert manager.config.pixel_sampler.fisheye_crop_radius is None
 
 
+def test_a_photograph_that_is_tested_and_trained_on_is_said(
+    scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = LecoDataManagerConfig(**options(scene))
+    config.setup(device="cpu")
+    assert "trained on too" not in capsys.readouterr().out
+    change(scene, lambda meta: meta["val_filenames"].append(meta["train_filenames"][0]))
+    config.setup(device="cpu")
+    assert "1 test photograph is trained on too: " in " ".join(capsys.readouterr().out.split())
+
+
 @pytest.mark.parametrize("kept", ["memory", "disk"])
 @pytest.mark.parametrize("reader", [LecoPhotographsDataParserConfig, NerfstudioDataParserConfig])
 def test_all_photographs_may_train(
