@@ -266,7 +266,7 @@ def require_not_its_own(out: Path, description: Path) -> None:
     own = load_json(description).get("ply_file_path")
     files = {description.resolve(): description.name}
     if isinstance(own, str):
-        files[(description.parent / own).resolve()] = "points"
+        files[find_file(description.parent / own).resolve()] = "points"
     if kind := files.get(out.resolve()):
         raise InputError(f"--out {out} is the scene's own {kind}: give another name")
 

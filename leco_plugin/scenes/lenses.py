@@ -17,6 +17,8 @@ DISTORTIONS = ("k1", "k2", "k3", "k4", "p1", "p2")
 PINHOLE_FIELDS = ("w", "h", "fl_x", "fl_y", "cx", "cy")
 ANGLES = ("x_fov", "y_fov", "camera_angle_x", "camera_angle_y", "fovx", "fovy")
 """Fields of view: what instant-ngp and Blender write beside or instead of focal lengths."""
+SHORTEST = 0.05
+"""Of the width, the least focal length: a plane would show 169 degrees, and no lens bends so."""
 OTHER_LENSES = ("k5", "k6", "s1", "s2", "s3", "s4", "b1", "b2", "skew", "omega", "xi")
 """Coefficients that programs write and nerfstudio's cameras lack."""
 OTHER_MODES = ("latlong", "equirectangular", "orthographic", "lens_mode", "lens_model")
@@ -78,6 +80,9 @@ def lens_of(meta: dict[str, Any], frame: dict[str, Any], where: str) -> Lens:
     distortion = _distortion(frame, kind, where) or _distortion(meta, kind, where)
     cx, cy = said("cx", positive=False), said("cy", positive=False)
     width, height = said("w"), said("h")
+    if fx and width and fx < SHORTEST * width and kind in (None, *MIXED):
+        given = f"{where}: fl_x is {fx:g} where w is {width:g}"
+        raise InputError(f"{given}: give focal lengths and cx, cy in pixels, not in shares")
     radius = said("fisheye_crop_radius") if kind in FISHEYES else None
     return Lens(kind, fx, fy, cx, cy, width, height, distortion, angle_x, angle_y, radius)
 

@@ -57,6 +57,7 @@ def test_a_fisheye_of_instant_ngp_is_one() -> None:
     [
         ({"camera_model": "OPENCV", "is_fisheye": True}, "is_fisheye is set: remove one"),
         ({"camera_model": "FULL_OPENCV"}, "FULL_OPENCV' is none of"),
+        ({"w": 800, "fl_x": 1.2, "cx": 0.5}, "fl_x is 1.2 where w is 800: give .* in pixels"),
         ({"k5": 0.1}, "k5 describes a lens"),
         ({"ftheta_p0": 0.1}, "ftheta_p0 describes a lens"),
         ({"equirectangular": True}, "equirectangular describes a lens"),
