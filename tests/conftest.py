@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import checkout  # noqa: F401
 import pytest
+import quick_imports  # noqa: F401
 import tiny_scene as tiny_scene_writer
 import torch
 
@@ -121,7 +122,9 @@ def forks() -> None:
     ours = ["mortal_training", "data_parallel_training"]
     context = multiprocessing.get_context("forkserver")
     models = ["leco_plugin.hosts.guided", "nerfstudio.models.instant_ngp"]  # what ranks build
-    context.set_forkserver_preload([*ours, "leco_plugin.conformance.cases", *models])
+    context.set_forkserver_preload(
+        ["quick_imports", *ours, "leco_plugin.conformance.cases", *models]
+    )
     paths = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", os.pathsep.join(paths))

@@ -29,6 +29,7 @@ from leco_plugin.studio.commands import (
 
 FORKS = """
 import json, os, sys
+import quick_imports
 import nerfstudio.engine.trainer, nerfstudio.pipelines.base_pipeline  # most of the seconds
 assert "leco_plugin.method_configs" not in sys.modules
 log, programs = sys.argv[1], json.loads(sys.argv[2])
@@ -75,7 +76,8 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> Ended:
     programs = [([program], RAISE.format(error)) for program, error, _ in PROGRAMS]
     programs.append((["eval", "--load-config", str(config)], MODULE))
     command = [sys.executable, "-c", FORKS, f"{folder}/", json.dumps(programs)]
-    done = subprocess.run(command, capture_output=True, text=True)
+    tests = Path(__file__).parents[1]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tests)
     statuses = done.stdout.split()
     assert len(statuses) == len(programs), done.stderr
     printed = [(folder / str(number)).read_text() for number in range(len(programs))]
