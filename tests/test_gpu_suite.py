@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import os
 import resource
+import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import gpu_floor
 import gpu_paper
@@ -30,7 +32,7 @@ BENCHMARKS = HERE.parent / "benchmarks"
 PARTS = ["correctness", "gate", "sampling", "experts", "learned", "dense"]
 
 ON_A_BARE_MACHINE = """
-import pathlib, runpy, sys
+import os, pathlib, runpy, sys
 THERE = {
     "torch", "torchgen", "functorch", "numpy", "leco_plugin", "typing_extensions", "sympy",
     "mpmath", "networkx", "jinja2", "markupsafe", "fsspec", "filelock",
@@ -46,10 +48,18 @@ class FindsThese:
         if package in THERE or package.startswith("_sysconfigdata"):
             return self.finder.find_spec(name, path, target)
 sys.meta_path[:] = map(FindsThese, sys.meta_path)
-sys.argv = ["gpu.py", "--dry-run", "--out", sys.argv[2]]
-runpy.run_path("gpu.py", run_name="__main__")
+import gpu  # and all that it imports, once for all runs
+for out in map(str.strip, sys.stdin):
+    child = os.fork()
+    if child == 0:
+        os.dup2(2, 1)
+        sys.argv = ["gpu.py", "--dry-run", "--out", out]
+        runpy.run_path("gpu.py", run_name="__main__")
+    print(child, flush=True)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 """
-"""Torch and numpy are there, what torch itself requires, this package, and nothing else."""
+"""Torch and numpy are there, what torch itself requires, this package, and nothing else. A dry run,
+in a fork, for each results file that is named; what is printed is its process and its status."""
 A_MINUTE = 60.0
 
 
@@ -73,29 +83,46 @@ def test_every_line_is_exercised_without_a_gpu() -> None:
 
 
 @contextmanager
-def on_a_bare_machine(out: Path) -> Iterator[subprocess.Popen[str]]:
-    """A dry run in a process of its own, which ends with the block at the latest."""
-    command = [sys.executable, "-c", ON_A_BARE_MACHINE, "--", str(out)]
-    with subprocess.Popen(
-        command, cwd=BENCHMARKS, env=environment(), text=True, stderr=subprocess.PIPE
-    ) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
+def on_a_bare_machine(said: Path) -> Iterator[Callable[[Path], tuple[int, Callable[[], int]]]]:
+    """Starts a dry run with a results file: returns its process, and what waits for its status.
+
+    Args:
+        said: a file for what the runs say.
+    """
+    command = [sys.executable, "-c", ON_A_BARE_MACHINE]
+    pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with (
+        said.open("w") as errors,
+        subprocess.Popen(
+            command, cwd=BENCHMARKS, env=environment(), stderr=errors, **pipes
+        ) as machine,
+    ):
+
+        def answer() -> int:
+            line = machine.stdout.readline()
+            assert line, said.read_text()[-2000:]
+            return int(line)
+
+        def start(out: Path) -> tuple[int, Callable[[], int]]:
+            print(out, file=machine.stdin, flush=True)
+            return answer(), answer
+
+        yield start
 
 
 def test_a_killed_run_on_a_bare_machine_goes_on_where_it_stopped(tmp_path: Path) -> None:
-    out, used = tmp_path / "gpu.json", seconds_of_ended_processes()
-    with on_a_bare_machine(out) as first:
+    out, said, used = tmp_path / "gpu.json", tmp_path / "said", seconds_of_ended_processes()
+    with on_a_bare_machine(said) as start:
+        first, status = start(out)
         while not (out.exists() and "gate" in json.loads(out.read_text())["parts"]):
-            assert first.poll() is None, first.communicate()[1]
+            assert Path(f"/proc/{first}").exists(), said.read_text()[-2000:]
             time.sleep(0.05)
-    before = json.loads(out.read_text())["parts"]
-    assert len(before) < len(PARTS)
-    with on_a_bare_machine(out) as second:
-        _, error = second.communicate()
-    assert second.returncode == 0, error
+        os.kill(first, signal.SIGKILL)
+        assert status() == -signal.SIGKILL
+        before = json.loads(out.read_text())["parts"]
+        assert len(before) < len(PARTS)
+        _, status = start(out)
+        assert status() == 0, said.read_text()[-2000:]
     after = json.loads(out.read_text())["parts"]
     assert list(after) == PARTS and {name: after[name] for name in before} == before
     assert seconds_of_ended_processes() - used < A_MINUTE
