@@ -162,6 +162,7 @@ def _end(status: int) -> None:
 
 
 def _serve() -> None:
+    import quick_imports  # noqa: F401
     from mortal_training import leave_out_the_cache
 
     for name, entry in ENTRY_POINTS.items():
