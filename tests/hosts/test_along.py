@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -125,9 +126,11 @@ def test_teaching_leaves_random_numbers_as_they_were(
     made: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seeded: list[int] = []
+    made.teacher.config = replace(CONFIG, sharpening=replace(SMALL, steps=40))
     monkeypatch.setattr(torch.cuda, "manual_seed_all", seeded.append)
     before = torch.get_rng_state()
     made.teacher._teach(1)
+    assert made.guide.the_occupancy().threshold > OPEN, "it guides from now on"
     assert torch.equal(torch.get_rng_state(), before) and seeded == []
 
 
