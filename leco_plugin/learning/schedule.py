@@ -42,7 +42,7 @@ class ScheduleConfig:
     """Of leco-occupancy: steps between two entries of `occupancy_history.safetensors` in the run's
     folder, from which `leco inspect` draws how the occupancy was learned; 0 writes none."""
     steps_per_check: int = 25
-    """Steps between two looks at the gate."""
+    """Steps between two checks of whether the gate has settled."""
     agreement: float = 0.99
     """Share of probe positions whose decision is the same in two checks running, from which on the
     gate is frozen, after `earliest`."""

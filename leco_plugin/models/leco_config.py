@@ -82,8 +82,8 @@ class LecoModelConfig(ModelConfig):
     """Share of the distortion loss that stays when the first phase is over and detail is wanted."""
     front_to_back: bool | None = None
     """Whether rendering shades from the front and nothing behind opaque surfaces: fewer samples for
-    the same image, and more steps to get there. None: guided, and on a CPU in batches of 2048 rays
-    or more, where that was measured to be no slower."""
+    the same image, and more steps to get there. None: where that was measured to be no slower,
+    which is in C on a CPU and, without C, for guided batches of 2048 rays or more there."""
     homogeneous: bool = False
     """A mixture of scene experts only, for comparison: no empty-space expert, nothing to freeze."""
     precision: Precision | None = None
