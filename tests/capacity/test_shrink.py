@@ -108,7 +108,7 @@ def test_without_a_run_it_keeps_to_the_decisions_and_says_so(
     unknown = ("lost_surface_mass", "lost_mass", "image_price_db")
     assert [smaller.report[name] for name in unknown] == [None] * 3
     assert prices(smaller.report) == {}
-    assert run("inspect", out) == 0 and "lost decisions: " in capsys.readouterr().out
+    assert run("inspect", out) == 0 and "lost_decisions: " in capsys.readouterr().out
     again = shrunk(out, [], *bound).smaller
     assert again.report["lost_decisions"] == pytest.approx(beyond)
     assert describe(smaller)["kept_share_of_box"] == pytest.approx(

@@ -104,7 +104,7 @@ def test_only_what_two_photographs_show_is_exported_whatever_the_frame(
     meta = {
         "w": 100,
         "h": 100,
-        "fl_x": 1.0,  # which sees all of the ball
+        "fl_x": 5.0,  # which sees all of the ball
         "cx": 50.0,
         "cy": 50.0,
         "frames": frames,
