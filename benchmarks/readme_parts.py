@@ -15,6 +15,7 @@ from walk import with_walk
 from leco_plugin.chart.learned import last_gain
 from leco_plugin.chart.summary import Line, compare, describe_seeds, lines_of
 from leco_plugin.evaluation.report import describe_cores
+from leco_plugin.learning.calibration import in_decibels
 
 DEMO = "<!-- demo: generated -->", "<!-- end of the demo -->"
 GAIN = "<!-- gain: generated -->", "<!-- end of the gain -->"
@@ -142,13 +143,12 @@ def demo_table(report: dict[str, Any]) -> str:
         ],
     )
     facts = report["occupancy"]
-    price = round(facts["image_price_db"], 3) + 0.0  # no minus before zero
     lines += [
         "",
         f"Occupancy: {facts['bytes'] / 1000:.0f} kB, learned and frozen in "
         f"{report['runs'][0]['freeze_seconds']:.0f} of "
         f"{report['runs'][0]['train_seconds']:.0f} s; {facts['empty_fraction']:.1%} of all "
-        f"candidates skipped for {price:+.3f} dB and "
+        f"candidates skipped for {in_decibels(facts['image_price_db'])} and "
         f"{facts['lost_surface_mass']:.1e} of the surface mass on held-out rays. Against the exact "
         f"city: {facts['kept_surface_recall']:.1%} of the visible surface kept, "
         f"{facts['free_space_skipped']:.1%} of free space skipped.",

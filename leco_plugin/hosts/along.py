@@ -28,7 +28,6 @@ from leco_plugin.learning.calibration import (
     THRESHOLDS,
     CalibrationConfig,
     Measured,
-    added_costs,
     image_price,
     measure,
 )
@@ -183,7 +182,7 @@ class Along:
             note(f"{what} skips no more within its bounds than the {skipped:.1%} that are skipped")
             return
         say(f"{what} {found.line}, where {skipped:.1%} were skipped")
-        costs = found._asdict() | added_costs(found._asdict(), before.report)
+        costs = found.on_top_of(before.report)._asdict()
         known = {name: value for name, value in before.report.items() if name not in OF_A_GATE}
         report = {**known, **costs, "step": step, "learned": "along"}
         report |= {"params": sum(p.numel() for p in gate.parameters())}
@@ -260,10 +259,6 @@ class Along:
         """The largest threshold within the bounds of a config, together with what gates before it
         have cost, and what it costs; None where none is."""
         before = self.guide.the_occupancy()
-
-        def within(found: Measured) -> bool:
-            return found._replace(**added_costs(found._asdict(), before.report)).within(config)
-
         asked = before.with_gate(gate, THRESHOLDS[0], {})
         with torch.no_grad():
             reference = heard.reference(asked.of_mapped(heard.mapped))
@@ -275,13 +270,14 @@ class Along:
             while number < len(THRESHOLDS):
                 threshold = THRESHOLDS[number]
                 found = measure(rendering, threshold, with_image=False)
-                if not within(found._replace(image_price_db=0.0, price_error_db=0.0)):
+                cheap = found._replace(image_price_db=0.0, price_error_db=0.0)
+                if not cheap.on_top_of(before.report).within(config):
                     number += 1
                     continue
                 self.guide.set_occupancy(asked.with_threshold(threshold))
                 price, error = image_price(self._errors(bundle, truth), errors, NO_ERROR)
                 found = found._replace(image_price_db=price, price_error_db=error)
-                if within(found):
+                if found.on_top_of(before.report).within(config):
                     return found
                 number += LOWER
         finally:

@@ -92,11 +92,14 @@ class Measured(NamedTuple):
     @property
     def line(self) -> str:
         """In the words of the log."""
-        price = round(self.image_price_db, 3) + 0.0  # no minus before zero
         return (
-            f"skips {self.empty_fraction:.1%} for {price:+.3f} dB and "
+            f"skips {self.empty_fraction:.1%} for {in_decibels(self.image_price_db)} and "
             f"{self.lost_surface_mass:.2e} of the surface mass"
         )
+
+    def on_top_of(self, before: Mapping[str, Any]) -> Measured:
+        """The same with the costs of both, where a report says what skipping has cost before."""
+        return self._replace(**added_costs(self._asdict(), before))
 
     def within(self, config: CalibrationConfig) -> bool:
         """Whether neither price is found to be beyond its bound, by `SURE` standard errors, nor
@@ -111,6 +114,11 @@ class Measured(NamedTuple):
                 (self.image_price_db, self.price_error_db, config.image_price_db),
             )
         )
+
+
+def in_decibels(price: float) -> str:
+    """What skipping costs in PSNR, without a minus before zero."""
+    return f"{round(price, 3) + 0.0:+.3f} dB"
 
 
 LOSSES = ("lost_surface_mass", "lost_mass", "image_price_db")
@@ -325,10 +333,6 @@ def calibrate(
         spent: the report of what has skipped so far, if prices are of skipping more than that. Both
             together are held to the bounds.
     """
-
-    def within(found: Measured) -> bool:
-        return found._replace(**added_costs(found._asdict(), spent)).within(config)
-
     best, earlier = None, _worst_so_far(spent)
     if earlier > config.camera_surface_mass:
         earlier = 0.0  # no threshold did justice to that view; others are still looked after
@@ -338,10 +342,11 @@ def calibrate(
             continue
         if not missed_only:
             cheap = measure(rendering, threshold, with_image=False)
-            if not within(cheap._replace(image_price_db=0.0, price_error_db=0.0)):
+            cheap = cheap._replace(image_price_db=0.0, price_error_db=0.0)
+            if not cheap.on_top_of(spent).within(config):
                 continue
         measured = measure(rendering, threshold, missed_only=missed_only)
-        if not within(measured):
+        if not measured.on_top_of(spent).within(config):
             continue
         if not beyond:
             kept = 1.0 - measured.empty_fraction

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from leco_plugin.evaluation.metrics import psnr
+from leco_plugin.learning.calibration import in_decibels
 from leco_plugin.log import by_number, counted
 from leco_plugin.occupancy import CAMERAS_THAT_VOUCH
 
@@ -55,8 +56,8 @@ def price_in_words(report: dict[str, Any]) -> list[str]:
     if skipped is None or price is None or lost is None:
         return []
     return [
-        f"skips {skipped:.1%} of the candidates along rays, for {round(price, 3) + 0.0:+.3f} dB "
-        f"and {lost:.2%} of the surfaces, on the rays of its calibration"
+        f"skips {skipped:.1%} of the candidates along rays, for {in_decibels(price)} and "
+        f"{lost:.2%} of the surfaces, on the rays of its calibration"
     ]
 
 

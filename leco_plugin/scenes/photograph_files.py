@@ -86,7 +86,7 @@ def header_of(path: Path) -> Header:
     except (OSError, ValueError, EOFError, SyntaxError):
         if not os.path.exists(path):
             raise InputError(f"the image {path} is not there{remedy_for_missing(path)}") from None
-        if path.is_file() and is_pointer(path):
+        if is_pointer(path):
             raise InputError(f"{path} {FETCH}") from None
         raise InputError(f"{path} cannot be read as an image: {SAVE_ANEW}") from None
 

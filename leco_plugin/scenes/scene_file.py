@@ -28,6 +28,7 @@ from leco_plugin.scenes.lenses import (
 )
 from leco_plugin.scenes.photograph_files import find_file
 from leco_plugin.scenes.poses import ASKED
+from leco_plugin.scenes.whole_files import begins_with
 
 FRAMES = ("frames", "test_frames")
 """Lists of frames; the second is ScanNet++'s."""
@@ -325,20 +326,13 @@ def _images_option(folder: Path) -> str:
     return "" if place is None else f" --images-path {shlex.quote(str(place.relative_to(folder)))}"
 
 
-def _begins_with(path: Path, mark: bytes) -> bool:
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return mark in file.read(200)
-
-
 def _converter_for(data: Path) -> str | None:
     """The command that makes a scene of a folder; None where none is known."""
     if not data.is_dir():
         return None
     for sign, kind in CONVERTERS.items():
         mark = BEGIN_WITH.get(sign)
-        if any(mark is None or _begins_with(path, mark) for path in data.glob(sign)):
+        if any(mark is None or begins_with(path, mark) for path in data.glob(sign)):
             source = data / "images" if sign == "images" else data
             command, *options = kind.split()
             place = next((each for each in COLMAP if (data / each / "cameras.bin").is_file()), None)

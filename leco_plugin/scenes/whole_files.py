@@ -39,8 +39,15 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
 def is_pointer(path: Path) -> bool:
     """Whether a file only says where Git LFS has what belongs there."""
+    return begins_with(path, POINTER)
+
+
+def begins_with(path: Path, mark: bytes) -> bool:
+    """Whether a file's first 200 bytes hold a mark; those of a folder, or of no file, do not."""
+    if not path.is_file():
+        return False
     with path.open("rb") as file:
-        return file.read(len(POINTER)) == POINTER
+        return mark in file.read(200)
 
 
 def write_json(path: Path, value: Any, indent: int = 2, allow_nan: bool = False) -> None:
