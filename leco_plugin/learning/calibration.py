@@ -98,8 +98,13 @@ class Measured(NamedTuple):
         )
 
     def on_top_of(self, before: Mapping[str, Any]) -> Measured:
-        """The same with the costs of both, where a report says what skipping has cost before."""
-        return self._replace(**added_costs(self._asdict(), before))
+        """The same with the costs of both, and their standard errors, where a report says what
+        skipping has cost before."""
+        known = {name: float(before.get(name) or 0.0) for name in (*LOSSES, *ERRORS)}
+        # in this order NaN stays NaN
+        costs = {name: max(getattr(self, name), 0.0) + max(known[name], 0.0) for name in LOSSES}
+        errors = {name: math.hypot(getattr(self, name), known[name]) for name in ERRORS}
+        return self._replace(**costs, **errors)
 
     def within(self, config: CalibrationConfig) -> bool:
         """Whether neither price is found to be beyond its bound, by `SURE` standard errors, nor
@@ -127,14 +132,6 @@ ERRORS = ("surface_error", "price_error_db")
 """Standard errors of those."""
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 """A report by which nothing was skipped so far."""
-
-
-def added_costs(found: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, float]:
-    """What skipping costs on top of what earlier skipping has cost, and standard errors."""
-    known = {name: float(before.get(name) or 0.0) for name in (*LOSSES, *ERRORS)}
-    # in this order NaN stays NaN
-    costs = {name: max(found[name], 0.0) + max(known[name], 0.0) for name in LOSSES}
-    return costs | {name: math.hypot(found[name], known[name]) for name in ERRORS}
 
 
 def worst_loss(cameras: Sequence[Reference], threshold: float) -> float:

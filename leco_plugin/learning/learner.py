@@ -299,7 +299,7 @@ class Learner:
             return
         seconds = seconds_now() - started
         taught = f"a gate of {found.params:,} values, taught in {seconds:.0f} s"
-        say(f"step {step}: {taught}, {found.line}")
+        say(f"step {step}: {taught}, {found.line(mixture.report)}")
         if not found.pays:
             return
         report = found.report(mixture.report, mixture.gate.config)

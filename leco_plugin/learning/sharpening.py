@@ -10,7 +10,7 @@ gate should keep and skip; a gate alone is taught by it, in seconds.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
@@ -23,7 +23,6 @@ from leco_plugin.learning.calibration import (
     LOSSES,
     CalibrationConfig,
     Measured,
-    added_costs,
     calibrate,
     measure,
     promise,
@@ -171,11 +170,12 @@ class Sharpened(NamedTuple):
         """Learned values of the gate."""
         return sum(parameter.numel() for parameter in self.gate.parameters())
 
-    @property
-    def line(self) -> str:
-        """What it does, in the words of the log."""
+    def line(self, report: Mapping[str, Any]) -> str:
+        """What it does, in the words of the log. The costs of what has guided so far, whose report
+        this is, are among its own."""
         end = "" if self.pays else "; that is no more, and the gate stays"
-        return f"{self.measured.line}, where {self.before.empty_fraction:.1%} were skipped{end}"
+        both = self.measured.on_top_of(report).line
+        return f"{both} in all, where {self.before.empty_fraction:.1%} were skipped{end}"
 
     def report(self, before: dict[str, Any], learned: GateConfig) -> dict[str, Any]:
         """The report of an occupancy of this gate.
@@ -185,8 +185,7 @@ class Sharpened(NamedTuple):
                 has been trained without what it skips.
             learned: the gate that routes. It stays in the report, with what it did, as `learned`.
         """
-        measured = self.measured._asdict()
-        found = measured | added_costs(measured, before)
+        found = self.measured.on_top_of(before)._asdict()
         found[CAMERAS_THAT_VOUCH] = self.promised  # of other photographs nothing is known
         kept = {name: before[name] for name in ("threshold", "params", "empty_fraction", *LOSSES)}
         known = {"learned": {"gate": learned.to_dict(), **kept}}

@@ -15,7 +15,6 @@ from leco_plugin.learning.calibration import (
     THRESHOLDS,
     CalibrationConfig,
     Measured,
-    added_costs,
     backdrop_price,
     calibrate,
     image_price,
@@ -143,10 +142,10 @@ def test_what_was_spent_and_what_is_spent_now_are_held_to_one_bound(
 
 def test_a_price_that_nobody_knows_was_not_spent() -> None:
     """A report of another program may say null for a price."""
-    found = Measured(0.5, 1e-4, 1e-3, 0.02, 0.5, 1e-5, 1e-3)._asdict()
-    known = added_costs(found, {"lost_surface_mass": 2e-4, "image_price_db": None})
-    assert known["lost_surface_mass"] == pytest.approx(3e-4)
-    assert known["image_price_db"] == 0.02
+    found = Measured(0.5, 1e-4, 1e-3, 0.02, 0.5, 1e-5, 1e-3)
+    known = found.on_top_of({"lost_surface_mass": 2e-4, "image_price_db": None})
+    assert known.lost_surface_mass == pytest.approx(3e-4)
+    assert known.image_price_db == 0.02
 
 
 def test_what_a_photograph_has_lost_so_far_counts_against_its_bound() -> None:
@@ -239,10 +238,9 @@ def test_a_photograph_whose_loss_is_no_number_vouches_for_nothing() -> None:
 
 
 def test_a_cost_that_is_no_number_is_not_taken_for_none() -> None:
-    found = Measured(0.5, math.nan, 0.1, math.nan, 0.5)._asdict()
-    costs = added_costs(found, {"image_price_db": 0.01})
-    assert math.isnan(costs["image_price_db"]) and math.isnan(costs["lost_surface_mass"])
-    assert costs["lost_mass"] == 0.1
+    costs = Measured(0.5, math.nan, 0.1, math.nan, 0.5).on_top_of({"image_price_db": 0.01})
+    assert math.isnan(costs.image_price_db) and math.isnan(costs.lost_surface_mass)
+    assert costs.lost_mass == 0.1
 
 
 def test_nothing_is_skipped_when_no_threshold_fits() -> None:

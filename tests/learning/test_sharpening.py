@@ -309,7 +309,13 @@ def test_the_same_lesson_teaches_the_same_gate_whatever_was_drawn_before() -> No
 def test_what_does_not_pay_changes_nothing() -> None:
     few = Measured(0.5, 0.0, 0.0, 0.0, 0.5)
     found = Sharpened(Gate(GATE), few, few, None)
-    assert not found.pays and "the gate stays" in found.line
+    assert not found.pays and "the gate stays" in found.line({})
+
+
+def test_the_log_names_the_costs_of_both_gates() -> None:
+    before, more = (Measured(0.5, 2e-4, 0.0, 0.02, share) for share in (0.5, 0.75))
+    line = Sharpened(Gate(GATE), more, before, None).line({"image_price_db": 0.01})
+    assert line.startswith("skips 75.0% for +0.030 dB and 2.00e-04 of the surface mass in all")
 
 
 def test_a_small_gate_travels_with_a_checkpoint_and_leaves_when_the_gate_learns_again() -> None:
