@@ -191,6 +191,8 @@ class Occupancy(nn.Module):
         state = self.state_dict()
         del state[SEEN_CELLS]
         tensors = {name: _shorten(name, value) for name, value in state.items()}
+        _check_precision(path, self.precision)
+        _check_shapes(path, tensors, _expected_shapes(self.gate.config))
         _check_values(path, tensors)
         if not self.seen.everywhere:
             tensors[SEEN] = self.seen.to_bytes()
@@ -248,21 +250,14 @@ class Occupancy(nn.Module):
         if (seen is None) != (version == WITHOUT_SEEN):
             raise ValueError(f"{path} of version {version} and the tensor {SEEN!r} do not fit")
         precision = header.get("precision")
-        if precision not in get_args(Precision):
-            raise ValueError(f"{path} names an unknown precision {precision!r}")
+        _check_precision(path, precision)
         try:
             config = GateConfig.from_dict(json.loads(header["gate"]))
             report = json.loads(header["report"])
             expected = _expected_shapes(config)
         except _UNREADABLE as error:
             raise ValueError(f"{path} has a damaged header: {_line(error)}") from None
-        found = {name: (tuple(tensor.shape), tensor.dtype) for name, tensor in tensors.items()}
-        for name in sorted(expected.keys() | found.keys()):
-            if not _fits(name, expected.get(name), found.get(name)):
-                raise ValueError(
-                    f"{path}: tensor {name!r} is {found.get(name)}, "
-                    f"the header asks for {expected.get(name)}"
-                )
+        _check_shapes(path, tensors, expected)
         _check_values(path, tensors)
         try:
             cells = None if seen is None else cells_from_bytes(seen)
@@ -282,6 +277,23 @@ class Occupancy(nn.Module):
 def _check_shape(positions: Tensor) -> None:
     if positions.dim() != 2 or positions.shape[-1] != 3:
         raise ValueError(f"positions must be [N, 3], got {list(positions.shape)}")
+
+
+def _check_precision(path: Path, precision: str | None) -> None:
+    """Refuse the name of a type in which no gate is asked."""
+    if precision not in get_args(Precision):
+        raise ValueError(f"{path} names an unknown precision {precision!r}")
+
+
+def _check_shapes(path: Path, tensors: dict[str, Tensor], expected: dict[str, _Described]) -> None:
+    """Refuse other tensors than a gate of the header has."""
+    found = {name: (tuple(tensor.shape), tensor.dtype) for name, tensor in tensors.items()}
+    for name in sorted(expected.keys() | found.keys()):
+        if not _fits(name, expected.get(name), found.get(name)):
+            raise ValueError(
+                f"{path}: tensor {name!r} is {found.get(name)}, "
+                f"the header asks for {expected.get(name)}"
+            )
 
 
 def _check_values(path: Path, tensors: dict[str, Tensor]) -> None:

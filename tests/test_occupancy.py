@@ -343,6 +343,31 @@ def test_values_that_decide_nothing_are_neither_saved_nor_loaded(
         Occupancy.load(path)
 
 
+UNREADABLE = {
+    "a gate in float64": (lambda: occupancy().double(), "tensor 'gate.*float64"),
+    "walls in float64": (
+        lambda: occupancy(walls=torch.ones(6, dtype=torch.float64)),
+        "tensor 'walls'.*float64",
+    ),
+    "a precision that no gate is asked in": (
+        lambda: occupancy(precision="float64"),
+        "unknown precision 'float64'",
+    ),
+    "a gate of more experts than files have": (
+        lambda: Occupancy(Gate(GateConfig(scene_experts=65)), Space(), 0.5),
+        "scene_experts is 65",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", UNREADABLE)
+def test_what_could_not_be_loaded_again_is_not_saved(name: str, tmp_path: Path) -> None:
+    make, message = UNREADABLE[name]
+    with pytest.raises(ValueError, match=message):
+        make().save(tmp_path / "o.safetensors")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_what_lies_outside_the_walls_is_empty_also_after_a_round_trip(tmp_path: Path) -> None:
     torch.manual_seed(0)
     walls = torch.tensor([-1e6, -1e6, -0.2, 1e6, 1e6, 0.3])
