@@ -92,6 +92,8 @@ def grid_that_suffices(rows: Sequence[Row], times: float = TOLERANCE) -> Row | N
 def title_of(rows: Sequence[Row]) -> str:
     """What the scene needs, in ten words at most."""
     chosen = choose(rows)
+    if _keeps_all(chosen):
+        return "At this loss nothing can be skipped"
     if chosen["family"] == "grid":
         return f"A grid suffices: {_of_cells(chosen).replace('^3', '³')}"
     also = "; perhaps a grid" if grid_that_suffices(rows, TOLD_APART) else ""
@@ -103,6 +105,11 @@ def title_of(rows: Sequence[Row]) -> str:
 def verdict(rows: Sequence[Row]) -> str:
     """What the scene needs, in a sentence or two."""
     chosen = choose(rows)
+    if _keeps_all(chosen):
+        return (
+            "At this loss nothing can be skipped: all keep the whole volume. Let the field learn "
+            "longer (--learn-steps), or allow a larger --lost-surface-mass; both in a new --out."
+        )
     kept = f"keeps {chosen['kept_volume']:.1%} of the volume"
     if chosen["family"] == "grid":
         said = f"A grid suffices: {_of_cells(chosen)}, {kept}"
@@ -135,7 +142,7 @@ def _of_cells(grid: Row) -> str:
 
 def common_volume(rows: Sequence[Row]) -> int:
     """Number of the volume of `VOLUMES` at which losses are compared: what the chosen one keeps."""
-    kept = choose(rows)["kept_volume"]
+    kept = max(choose(rows)["kept_volume"], VOLUMES[0])
     return min(range(len(VOLUMES)), key=lambda i: abs(VOLUMES[i] / kept - 1.0))
 
 
@@ -206,8 +213,10 @@ def _draw_panel(panel: Any, rows: Sequence[Row], values: list[float], theme: The
 
 def circumstances(results: Mapping[str, Any]) -> str:
     machine, scene = results["machine"], results["scene"]
-    full = [row["size"] for row in results["representations"] if _keeps_all(row)]
-    left_out = f" (not drawn, as they keep all: {', '.join(full)})" if full else ""
+    rows = results["representations"]
+    full = [row["size"] for row in rows if _keeps_all(row)]
+    drawn = len(full) in (0, len(rows))  # all of them
+    left_out = "" if drawn else f" (not drawn, as they keep all: {', '.join(full)})"
     where = describe_cores(machine) if machine["device"] == "cpu" else machine["device"]
     return (
         f"{scene['name']}, {scene['train_images']} photographs; one field of "

@@ -113,3 +113,17 @@ def test_a_scene_where_everything_keeps_all_is_drawn(tmp_path: Path) -> None:
     }
     assert draw(results, tmp_path / "capacity.png").stat().st_size > 1000
     assert "; one CPU core. " in circumstances(results)
+    assert "not drawn" not in circumstances(results)
+    partly = results | {"representations": [SMALL_GATE, full[1]]}
+    assert "grids as octrees (not drawn, as they keep all: 32)" in circumstances(partly)
+
+
+def test_what_skips_nothing_is_not_said_to_suffice() -> None:
+    full = [one | {"kept_volume": 1.0} for one in (SMALL_GATE, LARGE_GATE, COARSE)]
+    assert title_of(full) == "At this loss nothing can be skipped"
+    assert verdict(full).startswith(title_of(full)) and "--learn-steps" in verdict(full)
+    assert "suffices" in title_of([*full, FINE])
+
+
+def test_a_volume_to_compare_at_is_found_where_next_to_nothing_is_kept() -> None:
+    assert common_volume([SMALL_GATE | {"kept_volume": 0.0}]) == 0
