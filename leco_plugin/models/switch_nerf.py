@@ -40,7 +40,6 @@ from leco_plugin.models.switch.rendering import (
 from leco_plugin.occupancy import gate_precision
 from leco_plugin.samplers.grid import OccupancyGridEstimator
 from leco_plugin.scenes.bounds import SceneBounds
-from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.learning_data import LearningData
 from leco_plugin.scenes.survey import announce, places_of
 from leco_plugin.space import Space
@@ -74,11 +73,6 @@ class SwitchNerfModel(Model):
     def populate_modules(self) -> None:
         """Builds the field, the sampler and the buffers that a checkpoint restores."""
         super().populate_modules()
-        if self.config.capacity_factor is not None and not self.config.capacity_factor > 0.0:
-            raise InputError(
-                f"capacity_factor must be positive, got {self.config.capacity_factor}; "
-                "leave it out for dropless routing"
-            )
         prepare_checkpoints()
         device = self.kwargs.get("device", "cpu")
         keep_freed_memory(device)

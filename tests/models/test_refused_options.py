@@ -16,7 +16,8 @@ from leco_plugin.learning.sharpening import SharpeningConfig
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.objective import GateLossConfig
-from leco_plugin.models.sizing.sizes import SMALL, check
+from leco_plugin.models.sizing.sizes import SMALL, check, with_size
+from leco_plugin.models.switch.field import LEAST, SwitchNerfModelConfig
 from leco_plugin.scenes.input_error import InputError
 
 NO_NUMBERS = (math.nan, math.inf)
@@ -47,6 +48,12 @@ REFUSED_OF_THE_MODEL: dict[str, tuple[float, ...]] = {
     "likely_above": (-0.1, 1.0, math.nan),
     "distortion_after": (-0.1, *NO_NUMBERS),
 }
+REFUSED_OF_SWITCH_NERF: dict[str, tuple[float, ...]] = {
+    "capacity_factor": (0.0, -1.0, *NO_NUMBERS),
+    **dict.fromkeys(("balance", "sigma_noise"), (-1e-6, *NO_NUMBERS)),
+    "early_stop_eps": (-0.1, 1.0, math.nan),
+    "grid_levels": (0,),
+}
 ALLOWED: dict[Any, dict[str, Any]] = {
     CalibrationConfig(): {"recheck_rays": 0, "lost_surface_mass": 0.0, "image_price_db": 0.0},
     MergingConfig(): {"image_price_db": -0.01, "rays": 1},
@@ -68,6 +75,11 @@ def name_of(field: str) -> str:
             for value in some
         ),
         *((LecoModelConfig(), f, v) for f, some in REFUSED_OF_THE_MODEL.items() for v in some),
+        *(
+            (SwitchNerfModelConfig(), f, value)
+            for f, some in REFUSED_OF_SWITCH_NERF.items()
+            for value in some
+        ),
     ],
 )
 def test_a_value_that_cannot_work_is_named_with_what_would(
@@ -131,3 +143,25 @@ def test_batches_of_no_rays_are_refused(batch: float) -> None:
 def test_a_field_that_cannot_be_built_is_refused(name: str, size: int) -> None:
     with pytest.raises(ValueError, match=f"the field's {name} is {size}, below"):
         check(replace(SMALL, field=replace(SMALL.field, **{name: size})))
+
+
+@pytest.mark.parametrize("skip", [-1, 2, 9])
+def test_a_layer_that_an_expert_does_not_have_cannot_see_its_input_again(skip: int) -> None:
+    sizes = with_size(SMALL, "field.experts.skip", skip)
+    with pytest.raises(ValueError, match=f"experts.skip is {skip}, and .* layers 0 to 1: "):
+        check(sizes)
+    with pytest.raises(InputError, match=f"field.skip is {skip}; it must be None or .* 0 to 0"):
+        one = with_size(SwitchNerfModelConfig().sizes, "field.layers", 1)
+        SwitchNerfModelConfig(sizes=with_size(one, "field.skip", skip))
+
+
+@pytest.mark.parametrize("path", LEAST)
+def test_a_switch_nerf_of_sizes_that_cannot_be_built_is_refused(path: str) -> None:
+    sizes = with_size(SwitchNerfModelConfig().sizes, path, LEAST[path] - 1)
+    with pytest.raises(InputError, match=f"sizes.{name_of(path)} is .*; it must be at least"):
+        SwitchNerfModelConfig(sizes=sizes)
+
+
+def test_an_empty_expert_without_layers_is_refused() -> None:
+    with pytest.raises(ValueError, match="the field's empty_layers is 0, not in 1"):
+        check(with_size(SMALL, "field.experts.empty_layers", 0))

@@ -253,12 +253,6 @@ def test_a_density_is_that_of_the_scenes_units() -> None:
     torch.testing.assert_close(model.opacity_of_a_step(positions), asked * step)
 
 
-@pytest.mark.parametrize("capacity_factor", [0.0, -1.0, float("nan")])
-def test_a_capacity_that_no_expert_could_have_is_refused(capacity_factor: float) -> None:
-    with pytest.raises(InputError, match="capacity_factor must be positive"):
-        new_model(capacity_factor=capacity_factor)
-
-
 @pytest.mark.parametrize("range_", [{"near": 0.0}, {"near": 1e4}, {"far": 1e-4}])
 def test_an_empty_range_of_rays_is_refused(range_: dict[str, float]) -> None:
     poses = torch.eye(4)[:3].repeat(3, 1, 1)

@@ -207,7 +207,7 @@ def _paths(sizes: Sizes) -> list[str]:
 
 BYTES_PER_VALUE = 16
 """A float32 weight, its gradient, and the two moments of Adam."""
-LARGEST_IN_FIELD = {**LARGEST_SIZES, "log2_table": 28}
+LARGEST_IN_FIELD = {**LARGEST_SIZES, "log2_table": 28, "empty_layers": 64}
 """Of the field, which no file has to hold."""
 
 
@@ -267,6 +267,11 @@ def _check_field(sizes: Sizes) -> None:
     for name, least in (("appearance_dim", 0), ("direction_octaves", 0), ("color_width", 1)):
         if getattr(sizes.field, name) < least:
             raise ValueError(f"the field's {name} is {getattr(sizes.field, name)}, below {least}")
+    if experts.skip is not None and not 0 <= experts.skip < experts.layers:
+        raise ValueError(
+            f"{CLI}.field.experts.skip is {experts.skip}, and an expert has the layers 0 to "
+            f"{experts.layers - 1}: name one of them, or None"
+        )
     if encoding.kind == "hash":
         if encoding.finest < encoding.coarsest:
             raise ValueError(

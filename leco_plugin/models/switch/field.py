@@ -22,7 +22,9 @@ from leco_plugin.models.field import ColorHead
 from leco_plugin.models.gate import logits_of
 from leco_plugin.models.hmoe import Expert
 from leco_plugin.models.rendering import Answers
+from leco_plugin.models.sizing.sizes import size_at
 from leco_plugin.scenes.bounds import BoundsConfig
+from leco_plugin.scenes.input_error import require
 
 SHIFT = -1.0
 """Added to the density head's answer before its softplus."""
@@ -215,6 +217,15 @@ def switch_sizes_for(device_type: str) -> SwitchSizes:
     return PAPER if device_type == "cuda" else SMALL
 
 
+LEAST = {
+    **dict.fromkeys(("field.experts", "field.width", "field.layers", "field.color_width"), 1),
+    **dict.fromkeys(("coarse", "candidates", "grid_resolution"), 1),
+    **dict.fromkeys(("field.octaves", "field.gate_layers", "field.direction_octaves"), 0),
+    **dict.fromkeys(("field.appearance_dim", "fine", "grid_warmup_steps"), 0),
+}
+"""The least that each size can be."""
+
+
 def _model() -> type:
     from leco_plugin.models.switch_nerf import SwitchNerfModel
 
@@ -255,3 +266,23 @@ class SwitchNerfModelConfig(ModelConfig):
     """Where rays end, scene units; None is found from the data."""
     bounds: BoundsConfig = field(default_factory=BoundsConfig)
     """Where the scene lies, where the data do not say it right."""
+
+    def __post_init__(self) -> None:
+        for path, least in LEAST.items():
+            size, option = size_at(self.sizes, path), f"sizes.{path.replace('_', '-')}"
+            require(size >= least, option, size, f"at least {least}")
+        skip, layers = self.sizes.field.skip, self.sizes.field.layers
+        has_layer = skip is None or 0 <= skip < layers
+        require(
+            has_layer, "sizes.field.skip", skip, f"None or the number of a layer, 0 to {layers - 1}"
+        )
+        for name in ("balance", "sigma_noise"):
+            weight = getattr(self, name)
+            require(
+                0.0 <= weight < math.inf, name.replace("_", "-"), weight, "a number, at least 0"
+            )
+        eps, places = self.early_stop_eps, self.capacity_factor
+        require(0.0 <= eps < 1.0, "early-stop-eps", eps, "at least 0 and below 1")
+        require(self.grid_levels >= 1, "grid-levels", self.grid_levels, "at least 1")
+        has_places = places is None or 0.0 < places < math.inf
+        require(has_places, "capacity-factor", places, "above 0, or None for dropless routing")
