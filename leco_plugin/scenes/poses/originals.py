@@ -133,8 +133,9 @@ their names end so: pycolmap reads no other."""
 SCAN, DESCRIPTIONS = 0xDA, (*range(0xE0, 0xF0), 0xFE)
 """Markers in a JPEG: where pixels begin, and segments of applications, EXIF's, and comments."""
 FEWEST = 3
-LONGEST = 80
-"""Letters of a copy's name, its last ones: of 255 bytes that one may have, each takes up to 3."""
+LONGEST, MOST_BYTES = 80, 240
+"""Letters and bytes of a copy's name, its last ones: it may have 255 bytes, with a number before it
+and an ending behind."""
 QUALITY = 95
 """Of a JPEG that is written anew."""
 MOST_EXIF = 65_533
@@ -302,6 +303,7 @@ def _read(path: Path, folder: Path) -> Photograph:
         with Image.open(path) as image:
             exif = read_exif(image)
     name = re.sub(r"[^\w.\-]+", "_", "_".join(path.relative_to(folder).parts))[-LONGEST:]
+    name = name.encode()[-MOST_BYTES:].decode(errors="ignore")
     photograph = Photograph(path, name, header, exif)
     suffix = path.suffix.lower()
     if photograph.is_copied or (suffix in COPIED["JPEG"] and not header.transparent):

@@ -239,11 +239,16 @@ def test_long_names_of_folders_are_cut_to_what_a_file_may_have(
     assert len(names[1]) <= 80
 
 
-def test_the_longest_name_in_letters_of_three_bytes_is_written(
-    folder: Path, tmp_path: Path
+@pytest.mark.parametrize(("letter", "most"), [("\u6d77", 80), ("\U00020000", 63)])
+def test_the_longest_name_in_letters_of_several_bytes_is_written(
+    letter: str, most: int, folder: Path, tmp_path: Path
 ) -> None:
-    (folder / "IMG_0.jpg").rename(folder / ("\u6d77" * 80 + ".jpg"))
-    assert max(map(len, copies(folder, tmp_path / "out"))) == 80
+    (folder / letter).mkdir()
+    longest = letter * (250 // len(letter.encode()))
+    with Image.open(folder / "IMG_0.jpg") as image:
+        image.save(folder / letter / f"{longest}.tif")
+    names = list(copies(folder, tmp_path / "out"))
+    assert max(map(len, names)) == most + len(".png")
 
 
 def test_a_copy_that_cannot_be_written_ends_the_work(folder: Path, tmp_path: Path) -> None:
