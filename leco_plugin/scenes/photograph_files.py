@@ -12,7 +12,7 @@ import os
 import re
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,6 +31,7 @@ CONVERTED = ("1", "P", "PA", "LA", "CMYK")
 """Modes that become one of these; of CMYK by Pillow's formula, without a colour profile."""
 SAVE_ANEW = "if the file is whole, save it as JPEG or PNG with 8 bits a channel, and give that name"
 """What to do about HEIC, OpenEXR and other kinds that Pillow does not read."""
+NO_RIGHT = "give yourself the right to read it, and to enter its folder"
 TURNS = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -82,7 +83,7 @@ def header_of(path: Path) -> Header:
         most = f"{2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f} megapixels that Pillow opens"
         raise InputError(f"{path} has more than the {most}: make it smaller") from None
     except PermissionError as error:
-        raise InputError(f"{path}: {error.strerror}: give yourself the right to read it") from None
+        raise InputError(f"{path}: {error.strerror}: {NO_RIGHT}") from None
     except (OSError, ValueError, EOFError, SyntaxError):
         if not os.path.exists(path):
             raise InputError(f"the image {path} is not there{remedy_for_missing(path)}") from None
@@ -119,11 +120,22 @@ def find_file(path: Path) -> Path:
 
 
 def check_images(paths: list[Path]) -> None:
-    """InputError if an image is not there."""
-    if missing := [path for path in paths if not os.path.exists(path)]:
+    """InputError if an image is not there, or its folder may not be entered."""
+    if missing := [path for path in paths if _is_missing(path)]:
         some = f"{len(missing)} of {counted(len(paths), 'image')}"
         some += by_number(len(missing), " is", " are") + " not there, the first is"
         raise InputError(f"{some} {missing[0]}{remedy_for_missing(missing[0])}")
+
+
+def _is_missing(path: Path) -> bool:
+    """Whether a file is not there. InputError if a folder on the way may not be entered."""
+    try:
+        os.stat(path)
+    except PermissionError as error:
+        raise InputError(f"{path}: {error.strerror}: {NO_RIGHT}") from None
+    except (OSError, ValueError):
+        return True
+    return False
 
 
 def remedy_for_missing(path: Path) -> str:
@@ -138,7 +150,10 @@ def remedy_for_missing(path: Path) -> str:
         )
     if os.path.islink(path):
         return f": it is a link to {path.readlink()}, which is not there"
-    for name in sorted(os.listdir(path.parent)) if path.parent.is_dir() else ():
+    beside: list[str] = []
+    with suppress(OSError):  # there is no such folder, or it may not be read
+        beside = sorted(os.listdir(path.parent))
+    for name in beside:
         if Path(name).stem.lower() == path.stem.lower():
             return f": there is {name}, write its name like that"
         if not path.suffix and name.startswith(f"{path.name} "):
@@ -351,5 +366,6 @@ def _fit(seen: NDArray[np.bool_], size: tuple[int, int], path: Path) -> NDArray[
     off = max(abs(wide - factor * size[0]), abs(high - factor * size[1]))
     if factor <= 1 or off > factor:
         sizes = f"{wide} x {high} pixels, its image {size[0]} x {size[1]}"
-        raise InputError(f"the mask {path} has {sizes}")
+        remedy = "save it as large as its image, or a whole number of times that"
+        raise InputError(f"the mask {path} has {sizes}: {remedy}")
     return np.asarray(Image.fromarray(seen).resize(size, Image.Resampling.NEAREST))

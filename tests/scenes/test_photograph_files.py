@@ -204,6 +204,20 @@ def test_a_photograph_that_may_not_be_read_is_not_called_damaged(
         header_of(tmp_path / "a.jpg")
 
 
+def test_a_closed_folder_is_not_called_empty(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    with monkeypatch.context() as patched, refused(r"a\.jpg: Permission .*to enter its folder$"):
+        patched.setattr(os, "stat", refuse)
+        check_images([tmp_path / "a.jpg"])
+    monkeypatch.setattr(os, "listdir", refuse)
+    with refused(r"1 of 1 image is not there, .*a\.jpg: put it there"):
+        check_images([tmp_path / "a.jpg"])
+
+
 def test_a_smaller_picture_that_is_missing_has_a_way_around(tmp_path: Path) -> None:
     with refused(r"make it, 1/2 of .*--downscale-factor 1"):
         header_of(tmp_path / "images_2" / "a.png")
