@@ -85,7 +85,10 @@ def test_a_smaller_mask_is_made_of_the_one_of_full_size(tmp_path: Path) -> None:
 COLOURS = Image.fromarray(np.stack([SEEN * 255, SEEN * 0, SEEN * 0], axis=-1).astype(np.uint8))
 BAD = {
     "colours": (COLOURS, "has colours.*black.*white"),
-    "another size": (WHITE.resize((10, 10)), "has 10 x 10 pixels, its image 24 x 16: save it as large"),
+    "another size": (
+        WHITE.resize((10, 10)),
+        "has 10 x 10 pixels, its image 24 x 16: save it as large",
+    ),
     "all black": (Image.new("L", (24, 16)), "leave no pixel"),
 }
 
