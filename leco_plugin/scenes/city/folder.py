@@ -20,6 +20,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import os
 import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -37,7 +38,7 @@ from torch import Tensor
 import leco_plugin
 from leco_plugin.scenes.city.cameras import CaptureConfig, Lens, View, views_of
 from leco_plugin.scenes.city.city import DESCRIPTION, City, CityConfig, read_description
-from leco_plugin.scenes.input_error import one_line
+from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.mega_nerf_files import (
     TO_DRB,
     Coordinates,
@@ -52,7 +53,7 @@ from leco_plugin.scenes.whole_files import remove_parts, write_json, write_point
 Image8 = NDArray[np.uint8]
 LayoutName = Literal["nerfstudio", "mega-nerf"]
 TRANSFORMS = "transforms.json"
-MAPPINGS = "mappings.txt"
+MAPPINGS, COORDINATES = "mappings.txt", "coordinates.pt"
 PARTS = (("rgbs", "png"), ("metadata", "pt"))
 """Of a view in Mega-NeRF's format: the folders, and how the names in them end."""
 POINTS = "sparse_pc.ply"
@@ -186,7 +187,8 @@ def write_city(
     The folder appears under its name only when it is complete. Until then the pictures lie in a
     hidden folder beside it; a run that was killed is taken up there, and several may work on it.
     Without `capture` there are about 60 small aerial pictures for 3 blocks. FileExistsError if
-    `out_dir` holds something else, ValueError if it holds a damaged city; both leave it alone.
+    `out_dir` holds something else, ValueError if it holds a damaged city or cannot be replaced; all
+    leave it alone.
     """
     out_dir, capture = Path(out_dir), capture or CaptureConfig()
     parts = {"city": dataclasses.asdict(config), "capture": dataclasses.asdict(capture)}
@@ -198,13 +200,17 @@ def write_city(
     files = LAYOUTS[layout](views_of(city, capture), capture.lens, config.seed)
     drawn = f"{leco_plugin.__version__} {text}".encode()  # another version may draw it otherwise
     digest = hashlib.blake2b(drawn, digest_size=4).hexdigest()
-    unfinished = out_dir.parent / f".{out_dir.name}-unfinished-{digest}"
+    place = out_dir.resolve()  # of a link, the folder that it leads to
+    if os.path.ismount(place) or Path.cwd().is_relative_to(place):
+        fault = f"{out_dir} is where a disk is mounted, or where this command runs"
+        raise InputError(f"{fault}: give a folder in it")
+    unfinished = place.parent / f".{place.name}-unfinished-{digest}"
     unfinished.mkdir(parents=True, exist_ok=True)
     try:
         _photograph(city, files, unfinished, progress)
         files.finish(unfinished)
         write_whole(unfinished / DESCRIPTION, lambda file: file.write(text.encode()))
-        unfinished.replace(out_dir)
+        unfinished.replace(place)
         remove_parts(out_dir)  # not before: who loses a part to another finds the city there
     except OSError:
         # Somebody else may have finished the same city in the meantime.
@@ -260,13 +266,14 @@ def _holds(folder: Path, wanted: dict[str, Any]) -> bool:
 
 
 def _first_missing(folder: Path, layout: LayoutName) -> str | None:
-    """A file that a finished city names and does not hold."""
+    """A file that belongs to a finished city and is not there."""
     if layout == "nerfstudio":
         frames = read_transforms(folder)["frames"]
-        paths = [str(frame[key]) for frame in frames for key in FILE_FIELDS]
+        paths = [POINTS, *(str(frame[key]) for frame in frames for key in FILE_FIELDS)]
         return next((path for path in paths if not (folder / path).is_file()), None)
-    if not (folder / MAPPINGS).is_file():
-        return MAPPINGS
+    for name in (MAPPINGS, COORDINATES):
+        if not (folder / name).is_file():
+            return name
     there = {f"{path.parent.name}/{path.name}" for path in folder.glob("*/*/*")}
     lines = (folder / MAPPINGS).read_text(errors="replace").splitlines()
     stems = [Path(line.rsplit(",", 1)[-1]).stem for line in lines]

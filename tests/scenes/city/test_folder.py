@@ -21,6 +21,7 @@ from PIL import Image
 from leco_plugin.scenes.city.city import City, CityConfig
 from leco_plugin.scenes.city.folder import CaptureConfig, LayoutName, count_pictures, write_city
 from leco_plugin.scenes.city.render import Tracer
+from leco_plugin.scenes.input_error import InputError
 
 CITY = CityConfig(blocks=1, seed=3, sky=True)
 CAPTURE = CaptureConfig(40, 30, aerial_per_block=6, street_per_block=3, test_every=3)
@@ -98,12 +99,14 @@ def test_a_folder_or_file_of_something_else_is_refused(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["holiday.jpg"]
 
 
-@pytest.mark.parametrize("damage", ["picture", "depth", "transforms", "frames", "json", "config"])
+@pytest.mark.parametrize(
+    "damage", ["picture", "depth", "points", "transforms", "frames", "json", "config"]
+)
 def test_a_damaged_folder_gets_one_line(copy: Path, damage: str) -> None:
     if damage in ("picture", "depth"):
         next((copy / ("images" if damage == "picture" else "depths")).iterdir()).unlink()
-    elif damage == "transforms":
-        (copy / "transforms.json").unlink()
+    elif damage in ("points", "transforms"):
+        (copy / {"points": "sparse_pc.ply"}.get(damage, "transforms.json")).unlink()
     elif damage == "frames":
         (copy / "transforms.json").write_text('{"frames": [{"file_path": "images/a.png"}]}')
     elif damage == "json":
@@ -184,6 +187,30 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
+def test_a_city_is_written_into_the_folder_that_a_link_leads_to(
+    tmp_path: Path,
+) -> None:
+    for name in ("there", "not_yet"):
+        (tmp_path / f"to_{name}").symlink_to(tmp_path / name)
+    (tmp_path / "there").mkdir()
+    one = CaptureConfig(8, 8, aerial_per_block=2, street_per_block=0)
+    for name in ("there", "not_yet"):
+        assert write_city(CITY, tmp_path / f"to_{name}", one, False) == tmp_path / f"to_{name}"
+        assert count_pictures(tmp_path / name) == (2, 1)
+
+
+def test_a_folder_that_cannot_be_replaced_is_refused_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="where this command runs: give a folder in it"):
+        write_city(CITY, Path(), CAPTURE)
+    monkeypatch.setattr("os.path.ismount", lambda path: True)
+    with pytest.raises(InputError, match="a disk is mounted"):
+        write_city(CITY, tmp_path / "mounted", CAPTURE)
+    assert not any(tmp_path.iterdir())
+
+
 def test_an_interrupted_write_keeps_what_it_has_out_of_sight(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -233,7 +260,7 @@ def test_a_city_in_another_format_is_refused(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "lost", ["mappings.txt", "train/rgbs/000000.png", "val/metadata/000001.pt"]
+    "lost", ["mappings.txt", "coordinates.pt", "train/rgbs/000000.png", "val/metadata/000001.pt"]
 )
 def test_a_damaged_city_in_mega_nerfs_format_is_named(
     lost: str, mega_nerf: Path, tmp_path: Path
