@@ -227,7 +227,7 @@ class Pairs(NamedTuple):
 def choose_pairs(names: Sequence[str], exifs: Sequence[Exif], places: NDArray[np.float64]) -> Pairs:
     """The pairs to compare of photographs by name, EXIF and place [N, 3] in metres, or nan."""
     count = len(names)
-    everything = list(combinations(range(count), 2))
+    everything = combinations(range(count), 2)  # of 10,000 a list would take gigabytes
     order = capture_order(names, exifs)
     steps = {*range(1, NEXT + 1), *(2**power for power in range(count.bit_length()))}
     known = np.isfinite(places[:, 0])
@@ -242,7 +242,7 @@ def choose_pairs(names: Sequence[str], exifs: Sequence[Exif], places: NDArray[np
         also = ", and next in order, which GPS contradicts" if contradict else ""
         return Pairs(sorted(found), f"{NEIGHBOURS} nearest by GPS{also}")
     if order is None or count <= ANCHORS:  # few are all compared
-        return Pairs(everything, "all pairs")
+        return Pairs(list(everything), "all pairs")
     anchors = order[:: -(-count // ANCHORS)]
     loops = {(min(pair), max(pair)) for pair in combinations(anchors, 2)}
     return Pairs(sorted(_in_order(order, steps) | loops), f"{NEXT} next in order, and loops")

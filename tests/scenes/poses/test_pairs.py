@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from rendered_survey import grid
@@ -43,6 +45,16 @@ def test_near_photographs_are_compared_by_gps_and_far_ones_are_not() -> None:
     apart = [float(np.linalg.norm(places[one] - places[other])) for one, other in by_place]
     assert max(apart) < 120.0
     assert all(one < other for one, other in found.pairs)
+
+
+def test_pairs_that_are_not_compared_take_no_memory() -> None:
+    places = np.array(grid(30, 20, step=20.0))
+    tracemalloc.start()
+    try:
+        choose_pairs(names(600), [Exif()] * 600, places)
+        assert tracemalloc.get_traced_memory()[1] < 6e6  # all pairs have 13 MB
+    finally:
+        tracemalloc.stop()
 
 
 def test_photographs_without_gps_are_compared_with_what_is_next_to_them() -> None:
