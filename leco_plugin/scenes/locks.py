@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, one_line
 
 LOCK = ".running"
 """File that a run holds locked: the system lets go of it however the run ends."""
@@ -17,12 +17,10 @@ LOCK = ".running"
 @contextmanager
 def alone_in(folder: Path, work: str) -> Iterator[None]:
     """Makes a folder, and keeps other processes from the same `work` in it. InputError if one is at
-    work there, or it is no folder."""
-    try:
+    work there, or nothing can be written there."""
+    with writing_into(folder, "--out"):
         folder.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError):
-        raise InputError(f"{folder} is no folder; name another one with --out") from None
-    held = lock(folder)
+        held = lock(folder)
     if held is None:
         taken = f"another process makes the {work} in {folder}"
         raise InputError(f"{taken}; wait for it, or name another folder with --out")
@@ -30,6 +28,17 @@ def alone_in(folder: Path, work: str) -> Iterator[None]:
         yield
     finally:
         unlock(folder, held)
+
+
+@contextmanager
+def writing_into(folder: Path, option: str) -> Iterator[None]:
+    """While something is written into the folder of an option: InputError if that cannot be."""
+    try:
+        yield
+    except OSError as error:
+        why = error.strerror or one_line(error)
+        fault = f"nothing can be written into {folder} ({why})"
+        raise InputError(f"{fault}: name another folder with {option}") from None
 
 
 def lock(folder: Path, tries: int = 5) -> int | None:

@@ -21,8 +21,9 @@ from torch.nn.parallel import DistributedDataParallel
 
 from leco_plugin.log import say
 from leco_plugin.scenes.input_error import InputError, TrainingStopped
+from leco_plugin.scenes.locks import writing_into
 from leco_plugin.studio.checkpoints import follow_data
-from leco_plugin.studio.run_folder import claim, writing_into
+from leco_plugin.studio.run_folder import OUTPUT, claim
 from leco_plugin.studio.run_progress import is_short, short_screen
 from leco_plugin.studio.trainer import AtomicTrainer
 
@@ -85,7 +86,7 @@ class DataParallelTrainerConfig(TrainerConfig):
             self.timestamp = f"{wanted}-{len(reasons) + 1}"
         if reasons:
             say(f"{reasons[0]}; this run goes to {self.get_base_dir()}")
-        with writing_into(self.get_base_dir()), short_screen(self):
+        with writing_into(self.get_base_dir(), OUTPUT), short_screen(self):
             super().save_config()
 
 

@@ -11,8 +11,6 @@ import functools
 import inspect
 import os
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,11 +26,13 @@ from leco_plugin.learning.run import LearningOnly, Run
 from leco_plugin.log import counted
 from leco_plugin.models.compute.ranks import is_first
 from leco_plugin.models.sizing.sizes import sizes_in, sizes_to_resume
-from leco_plugin.scenes.input_error import InputError, one_line
-from leco_plugin.scenes.locks import lock, unlock
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.locks import lock, unlock, writing_into
 from leco_plugin.scenes.whole_files import write_whole
 from leco_plugin.studio.checkpoints import allow_checkpoint_globals, newest_whole, step_of
 
+OUTPUT = "--output-dir"
+"""The option that says where runs' folders are made."""
 _held: dict[Path, int] = {}
 """Descriptors of this process's locks, by folder."""
 
@@ -43,7 +43,7 @@ def claim(folder: Path, checkpoints: Path, load_from: Path | None) -> str | None
     if nothing can be written there."""
     place = folder.resolve()
     if place not in _held:
-        with writing_into(folder):
+        with writing_into(folder, OUTPUT):
             folder.mkdir(parents=True, exist_ok=True)
             held = lock(folder)
         if held is None:
@@ -57,18 +57,6 @@ def claim(folder: Path, checkpoints: Path, load_from: Path | None) -> str | None
         release(folder)
         return f"{folder} holds an earlier run, with which this one does not go on"
     return None
-
-
-@contextmanager
-def writing_into(folder: Path) -> Iterator[None]:
-    """While something is written into a run's folder: InputError where that cannot be done."""
-    try:
-        yield
-    except OSError as error:
-        raise InputError(
-            f"nothing can be written into {folder} ({error.strerror or one_line(error)}): name "
-            "another folder with --output-dir"
-        ) from None
 
 
 def release(folder: Path) -> None:
@@ -123,7 +111,7 @@ def keep_sizes(config: Any, model: Any, asked: Any) -> Any:
     path = config.get_base_dir() / CONFIG
     if is_first() and path.exists():  # what is not to be stored has none
         text = yaml.dump(config)
-        with writing_into(path.parent):
+        with writing_into(path.parent, OUTPUT):
             write_whole(path, lambda file: file.write(text.encode("utf8")))
     return config
 
