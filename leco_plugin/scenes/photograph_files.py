@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
-from leco_plugin.log import by_number, counted, say
+from leco_plugin.log import bar, by_number, counted, say
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.whole_files import FETCH, LONGEST, is_pointer, write_whole
 
@@ -84,7 +84,7 @@ def header_of(path: Path) -> Header:
         raise InputError(f"{path} has more than the {most}: make it smaller") from None
     except PermissionError as error:
         raise InputError(f"{path}: {error.strerror}: {NO_RIGHT}") from None
-    except (OSError, ValueError, EOFError, SyntaxError):
+    except Exception:  # noqa: BLE001  decoders raise whatever they meet
         if not os.path.exists(path):
             raise InputError(f"the image {path} is not there{remedy_for_missing(path)}") from None
         if is_pointer(path):
@@ -202,8 +202,8 @@ def decode(path: Path, turn: bool) -> Image.Image:
             # Pillow's exif_transpose writes all EXIF anew, and fails at tags of another type
             turning = TURNS.get(_orientation(image)) if turn else None
             return plain(image if turning is None else image.transpose(turning)).copy()
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        reason = one_line(error, 120)
+    except Exception as error:  # noqa: BLE001  decoders raise whatever they meet
+        reason = one_line(error, 120) or type(error).__name__
         raise InputError(f"{path} cannot be read ({reason}): is the file whole?") from None
 
 
@@ -284,19 +284,21 @@ def convert_masks(
     nerfstudio would read otherwise goes into `derived`. `sizes` are width and height of images;
     `speak` says what was taken for seen. InputError about a mask."""
     found, shown, grey = [], [], []
-    for wanted, image, size in zip(masks, images, sizes):
-        path = _found(wanted, image)
-        values = _values(path)
-        seen = _is_seen(values)
-        if bool(((values > 0) & ~seen).any()):
-            grey.append(path)
-        fitting = _fit(seen, size, path)
-        header = header_of(path)
-        is_grey = header.mode == "L" and not header.transparent
-        as_it_is = fitting is seen and bool((seen == (values > 0)).all()) and is_grey
-        made = partial(Image.fromarray, fitting.astype(np.uint8) * 255)
-        found.append(path if as_it_is else derived.get(path, f"mask {size}", made))
-        shown.append(bool(fitting.any()))
+    with bar("Reading masks") as progress:
+        for wanted, image, size in zip(masks, images, sizes):
+            path = _found(wanted, image)
+            values = _values(path)
+            seen = _is_seen(values)
+            if bool(((values > 0) & ~seen).any()):
+                grey.append(path)
+            fitting = _fit(seen, size, path)
+            header = header_of(path)
+            is_grey = header.mode == "L" and not header.transparent
+            as_it_is = fitting is seen and bool((seen == (values > 0)).all()) and is_grey
+            made = partial(Image.fromarray, fitting.astype(np.uint8) * 255)
+            found.append(path if as_it_is else derived.get(path, f"mask {size}", made))
+            shown.append(bool(fitting.any()))
+            progress(len(found) / len(masks))
     if not any(shown):
         images_of = counted(len(masks), "image")
         none = f"the masks leave no pixel of {images_of}, the first is {masks[0]}"

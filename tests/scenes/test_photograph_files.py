@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -224,6 +225,17 @@ def test_a_smaller_picture_that_is_missing_has_a_way_around(tmp_path: Path) -> N
     with refused(r"flight_2/a\.png is not there: put it there") as caught:
         header_of(tmp_path / "flight_2" / "a.png")
     assert "downscale" not in str(caught.value)
+
+
+def test_a_tiff_whose_second_directory_is_damaged_is_refused_by_name(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.tif", "RGB")
+    data = bytearray(path.read_bytes())
+    (at,) = struct.unpack_from("<I", data, 4)
+    (entries,) = struct.unpack_from("<H", data, at)
+    struct.pack_into("<I", data, at + 2 + 12 * entries, len(data))
+    path.write_bytes(data + struct.pack("<HHHIII", 1, 258, 3, 1, 8, 0))
+    with refused(r"a\.tif cannot be read as an image"):
+        header_of(path)
 
 
 @pytest.mark.parametrize("start", [b"v/1\x01", b"\0\0\0\x18ftypheic", b"#?RADIANCE\n", b"II*\0"])

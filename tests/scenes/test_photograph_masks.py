@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ from nerfstudio.data.utils.data_utils import get_image_mask_tensor_from_path
 from PIL import Image
 from scene_files import refused
 
+from leco_plugin.scenes import photograph_files
 from leco_plugin.scenes.photograph_files import DerivedImages, convert_masks
 
 SEEN = np.zeros((16, 24), dtype=bool)
@@ -80,6 +83,21 @@ def test_a_smaller_mask_is_made_of_the_one_of_full_size(tmp_path: Path) -> None:
         made = convert_masks([tmp_path / name], [Path("b.jpg")], [(12, 8)], derived, False)
         seen = get_image_mask_tensor_from_path(made[0])[..., 0].numpy()
         np.testing.assert_array_equal(seen, SEEN[::2, ::2])
+
+
+def test_progress_is_shown_for_each_mask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shares: list[float] = []
+
+    @contextmanager
+    def bar(what: str) -> Iterator[Callable[[float], None]]:
+        yield shares.append
+
+    monkeypatch.setattr(photograph_files, "bar", bar)
+    masks = [tmp_path / "a.png", tmp_path / "b.png"]
+    for path in masks:
+        WHITE.save(path)
+    convert_masks(masks, masks, 2 * [WHITE.size], DerivedImages(tmp_path / "cache"), False)
+    assert shares == [0.5, 1.0]
 
 
 COLOURS = Image.fromarray(np.stack([SEEN * 255, SEEN * 0, SEEN * 0], axis=-1).astype(np.uint8))
