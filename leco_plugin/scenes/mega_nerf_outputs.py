@@ -61,6 +61,9 @@ def read(config: MegaNerfDataParserConfig) -> MegaNerfScene:
     with bar("Reading the scene") as progress:
         scene = read_scene(config.data, config.check_axes, progress)
     note(scene.describe())
+    for frame in scene.frames:  # now, and not after minutes of resizing for training
+        if frame.split == "val":
+            scaled(frame, config.val_scale_factor)
     return scene
 
 
@@ -74,13 +77,6 @@ def outputs_of(
     frames = [frame for frame in scene.frames if frame.split in splits]
     factor = config.train_scale_factor if training else config.val_scale_factor
     derived = DerivedImages(config.cache or config.data / "leco-cache")
-    masks: list[Path] | None = None
-    if training:
-        frames, masks = _with_masks(config, frames, derived)
-    right = half and not training
-    images = _for_each(
-        "Resizing the pictures", frames, lambda frame: picture_of(frame, factor, right, derived)
-    )
     coordinates = scene.coordinates
     transform = torch.from_numpy(coordinates.transform())
     # the poses, scaled back, are in metres
@@ -93,6 +89,13 @@ def outputs_of(
         metadata |= points_in_model(read_cloud(points), transform / coordinates.metres)
     elif config.points is not None:
         raise InputError(f"there is no file {points} with sparse points")
+    masks: list[Path] | None = None
+    if training:
+        frames, masks = _with_masks(config, frames, derived)
+    right = half and not training
+    images = _for_each(
+        "Resizing the pictures", frames, lambda frame: picture_of(frame, factor, right, derived)
+    )
     outputs = DataparserOutputs(
         image_filenames=images,
         cameras=_cameras(scene, frames, factor, right),

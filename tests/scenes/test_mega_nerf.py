@@ -194,13 +194,6 @@ def test_sparse_points_in_metres_arrive_where_the_cameras_are(tmp_path: Path) ->
     assert outputs.metadata[METRES_PER_UNIT] == 1.0
 
 
-def test_a_file_of_points_that_is_not_there_is_named(tmp_path: Path) -> None:
-    folder = mega_nerf_scene.write(tmp_path / "scene")
-    config = MegaNerfDataParserConfig(data=folder, points=tmp_path / "none.ply")
-    with refused(r"none\.ply"):
-        config.setup().get_dataparser_outputs("train")
-
-
 def test_altitudes_of_mega_nerfs_configurations_cut_the_rays(scene: Path) -> None:
     """Its datum is 90 m above the origin, a unit 40 m: z is (-90 - metres down) / 40."""
     parser = MegaNerfDataParserConfig(data=scene, ray_altitude_range=(-30.0, 10.0))
@@ -224,3 +217,19 @@ def test_altitudes_above_the_datum_are_negative_on_the_command_line() -> None:
 def test_altitudes_in_another_order_are_refused(levels: tuple[float, float], scene: Path) -> None:
     with refused("the top and then the ground"):
         parse(scene, ray_altitude_range=levels)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"points": Path("none.ply")}, "there is no file none.ply"),
+        ({"val_scale_factor": 5}, "a scale factor of 5 does not divide"),
+    ],
+)
+def test_a_wrong_option_is_refused_before_pictures_are_resized(
+    settings: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    folder = mega_nerf_scene.write(tmp_path / "scene")
+    with refused(message):
+        parse(folder, train_scale_factor=2, **settings)
+    assert not (folder / "leco-cache").exists()
