@@ -122,9 +122,10 @@ def _triangulate(reconstructor: Reconstructor, cameras: Sequence[Any], poses: Ar
     mapper.filter_max_reproj_error = triangulation.complete_max_reproj_error = tolerance
     triangulation.merge_max_reproj_error = tolerance
     work.mkdir()
-    return pycolmap.triangulate_points(
-        given, reconstructor.database, reconstructor.images, work, options=options
-    )
+    with bar("placing points"):
+        return pycolmap.triangulate_points(
+            given, reconstructor.database, reconstructor.images, work, options=options
+        )
 
 
 def matched_features(reconstructor: Reconstructor) -> int:

@@ -185,7 +185,8 @@ class Reconstructor:
             for number in model.reg_image_ids():
                 moved.add_image(number)
             moved.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-            pycolmap.create_default_bundle_adjuster(options, moved, model).solve()
+            with bar("adjusting lenses and poses"):
+                pycolmap.create_default_bundle_adjuster(options, moved, model).solve()
         model.update_point_3d_errors()
 
 
