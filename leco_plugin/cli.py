@@ -5,6 +5,7 @@ Each subcommand imports what it needs inside, so that help comes at once.
 
 from __future__ import annotations
 
+import io
 import shlex
 import sys
 import time
@@ -229,6 +230,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs `leco`: 0, or one line on stderr and 2 for bad input, 1 for a failure."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     about = "Learned occupancy for nerfstudio: what is empty is skipped."
+    if isinstance(sys.stdout, io.TextIOWrapper):  # names of files need not be UTF-8
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         with warnings.catch_warnings():
             # what nerfstudio and torch think of each other is nothing that a user can act on

@@ -174,6 +174,17 @@ def test_city_writes_mega_nerfs_format(tmp_path: Path, capsys: pytest.CaptureFix
     assert facts["test_images"] == len(list((out / "val/rgbs").iterdir())) > 0
 
 
+def test_names_that_are_no_utf_8_are_printed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from leco_plugin.scenes.poses import command
+
+    monkeypatch.setattr(command, "make_scene", lambda *_: {})
+    monkeypatch.setattr(command, "summary", lambda _: ["not placed: " + os.fsdecode(b"\xe9.jpg")])
+    assert run("poses", "photos", "--out", "scene") == 0
+    assert capsys.readouterr().out.startswith("not placed: \\udce9.jpg\n")
+
+
 def bad_inputs(folder: Path, file: Path) -> dict[str, list[object]]:
     """Arguments that a user may well give, by what is wrong with them."""
     (folder / "text.safetensors").write_text("not an occupancy")

@@ -9,6 +9,8 @@ changes for a whole process, beside random seeds of `leco shrink`, `leco capacit
   traceback for what a user can mend | the process ends |
 | a filter of warnings, in `ns-train` of a method of ours | `commands`, for `scenes.city_dataparser`
   | torch has renamed what nerfstudio decorates its activations with | the process ends |
+| `check_ffmpeg_installed` of nerfstudio, in `ns-render` | `commands`, for `method_configs` | images
+  need no ffmpeg | the process ends |
 | the file of nerfstudio's console and of rich's, filters of warnings | `run_progress`, for
   `trainer` and `processes` | what nobody acts on goes to a run's log file | a run is set up,
   trained, or over |
@@ -30,6 +32,8 @@ changes for a whole process, beside random seeds of `leco shrink`, `leco capacit
   | `nerfacc_cpu.uninstall()`, which nothing here calls: models go on using them |
 | `mallopt` of glibc, for models on a CPU | `models.compute.device` | page faults at each step | the
   process ends: the blocks are those of all steps |
+| what `sys.stdout` writes for letters that it cannot, in `leco` | `cli` | the name of a photograph
+  need not be UTF-8 | the process ends |
 | filters of warnings, in `leco` | `cli` | nerfstudio's and torch's are of no use to a user |
   `main` returns |
 | methods of field classes | `evaluation.queries` | counts queries | the count is over |
