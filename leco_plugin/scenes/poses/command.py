@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from leco_plugin.log import bar, resumable
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.locks import alone_in
 from leco_plugin.scenes.poses import ASKED
 from leco_plugin.scenes.poses import georeference as world
@@ -28,7 +28,7 @@ from leco_plugin.scenes.poses.reconstruction import (
     load_pycolmap,
     require_disk,
 )
-from leco_plugin.scenes.scene_file import load_json
+from leco_plugin.scenes.scene_file import NO_SCENE, load_json
 from leco_plugin.scenes.whole_files import remove_parts, write_json
 
 REPORT = "poses.json"
@@ -134,7 +134,11 @@ def _finished(out: Path, asked: dict[str, Any]) -> dict[str, Any] | None:
         raise InputError(f"--out {out} was begun {why}: give another folder, or delete it")
     if found != asked or not (out / DESCRIPTION).is_file() or not (out / POINTS).is_file():
         return None
-    images = [out / frame["file_path"] for frame in load_json(out / DESCRIPTION)["frames"]]
+    try:
+        images = [out / frame["file_path"] for frame in load_json(out / DESCRIPTION)["frames"]]
+    except NO_SCENE as error:  # it may have been edited
+        fault = f"{out / DESCRIPTION} is no scene ({type(error).__name__}: {one_line(error, 80)})"
+        raise InputError(f"{fault}: mend it, or delete it to have it written anew") from None
     return _read(out / REPORT) if all(image.is_file() for image in images) else None
 
 

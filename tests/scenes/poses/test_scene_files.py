@@ -11,7 +11,10 @@ import pytest
 from PIL import Image
 from scene_files import read_ply
 
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig, read_points
+from leco_plugin.scenes.poses import ASKED
+from leco_plugin.scenes.poses.command import _finished
 from leco_plugin.scenes.poses.georeference import (
     Placement,
     intrinsics,
@@ -20,6 +23,7 @@ from leco_plugin.scenes.poses.georeference import (
     write_sparse_points,
 )
 from leco_plugin.scenes.scene_file import unused_fields
+from leco_plugin.scenes.whole_files import write_json
 
 IN_METRES = Placement(1.0, np.eye(3), np.zeros(3), residuals=np.zeros(3))
 OPENCV = [30.0, 31.0, 16.0, 12.0, 0.1, 0.01, 0.001, 0.002]
@@ -135,3 +139,13 @@ def test_points_with_large_coordinates_keep_their_digits(sign: float, tmp_path: 
     found = read_points({"ply_file_path": "points.ply"}, tmp_path)
     assert found is not None
     np.testing.assert_allclose(found.positions, places, rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("edited", ['{"frames": [', "[]", '{"frames": [{}]}'])
+def test_a_description_that_was_edited_wrongly_is_named(edited: str, tmp_path: Path) -> None:
+    asked = {"format": 2, "photographs": 3}
+    write_json(tmp_path / ASKED, asked)
+    (tmp_path / "sparse_pc.ply").touch()
+    (tmp_path / "transforms.json").write_text(edited)
+    with pytest.raises(InputError, match=r"transforms\.json is no scene .*: mend it, or delete it"):
+        _finished(tmp_path, asked)
