@@ -97,7 +97,7 @@ def quiet_imports_of_our_methods() -> None:
     """
     program = Path(*sys.argv[:1])
     trains = program.name.startswith(("ns-train", "train"))
-    ours = "".join(sys.argv[1:2]).startswith("leco-")
+    ours = "".join(sys.argv[1:2]).startswith(("leco-", "switch-nerf"))
     if is_ns_command(program) and (not trains or ours):
         hide_warnings_of_no_use()
 

@@ -227,6 +227,7 @@ def test_a_path_through_one_photograph_is_a_line(views: int) -> None:
         (["ns-eval"], True),
         (["nerfstudio/scripts/render.py", "interpolate"], True),
         (["ns-train", "leco-ngp"], True),
+        (["ns-train", "switch-nerf"], True),
         (["ns-train", "nerfacto"], False),
         (["notebook"], False),
         ([], False),  # of a program that Python is a part of
