@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 import shutil
 import sys
 from collections.abc import Callable
@@ -91,8 +90,6 @@ def train_job(
         on_progress=on_progress,
         on_frozen=when_frozen,
     )
-    if looked_at and not math.isfinite(run.psnr):
-        raise ValueError("it has diverged: the PSNR at its end is no number")
     facts = _occupancy_of(trainer, data, folder)
     if facts is not None:
         facts["at_equal_loss"] = _at_freezing(trainer, frozen, contender)

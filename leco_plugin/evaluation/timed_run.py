@@ -9,7 +9,7 @@ import copy
 import math
 import random
 import statistics
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -89,7 +89,7 @@ class TimedRun:
     peak_process_bytes: int | None = 0
     peak_allocator_bytes: int | None = None
     curve: list[tuple[float, float]] = field(default_factory=list)
-    """Seconds of training, and PSNR on test pixels."""
+    """Seconds of training, and PSNR on test pixels; stored without points that are no number."""
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values, rounded to what the measurement means; None where there is no number."""
@@ -97,7 +97,11 @@ class TimedRun:
             name: round(value, 4) if isinstance(value, float) else value
             for name, value in vars(self).items()
         }
-        values["curve"] = [[round(seconds, 2), round(psnr, 3)] for seconds, psnr in self.curve]
+        values["curve"] = [
+            [round(seconds, 2), round(psnr, 3)]
+            for seconds, psnr in self.curve
+            if math.isfinite(psnr)
+        ]
         return finite_or_null(values)
 
 
@@ -129,8 +133,13 @@ def timed_run(
         on_frozen: called off the clock when a model that learns its occupancy itself has frozen it.
     Returns:
         The record, and the trainer with its model.
+    Raises:
+        InputError: the scene has no test image; nothing was trained.
+        FloatingPointError: the PSNR at the end is no number.
     """
     trainer = set_up(config, budget, seed)
+    if (curve_points or images) and len(trainer.pipeline.datamanager.eval_dataset) == 0:
+        raise InputError("the scene has no test image, on which runs could be compared")
     run = TimedRun(config.method_name or "", sampler, seed)
     model = trainer.pipeline.model
     with count_queries(model) as queries:
@@ -140,6 +149,8 @@ def timed_run(
         if curve_points:
             errors = errors_on_rays(trainer, CURVE_RAYS)
             run.psnr = decibels(statistics.fmean(errors))
+            if not math.isfinite(run.psnr):
+                raise FloatingPointError("it has diverged: the PSNR at its end is no number")
             run.image_psnr = statistics.fmean(map(decibels, errors))
             run.curve.append((run.train_seconds, run.psnr))
         figures = evaluate_images(trainer, images, queries) if images else {}
@@ -319,14 +330,11 @@ def render_rays(model: Any, bundle: Any, at_once: int) -> Tensor:
 def errors_on_rays(trainer: Trainer, rays: int) -> list[float]:
     """Mean squared error of each test image on its share of `rays` pixels, the same at every call.
 
-    A full image of an unguided method takes minutes on a CPU; some thousand pixels say as much. A
-    scene without test images is an `InputError`.
+    A full image of an unguided method takes minutes on a CPU; some thousand pixels say as much.
     """
     pipeline = trainer.pipeline
     pipeline.eval()
     dataset: Any = pipeline.datamanager.eval_dataset
-    if len(dataset) == 0:
-        raise InputError("the scene has no test image, on which runs could be compared")
     generator = torch.Generator().manual_seed(0)
     per_image = -(-rays // len(dataset))
     cameras, errors = dataset.cameras.to("cpu"), []
@@ -351,16 +359,16 @@ def evaluate_images(trainer: Trainer, most_images: int, queries: Counter[str]) -
     The model has to have rendered before, so that nothing is built on the way.
 
     Returns:
-        Means of what `image_metrics` has, of `samples_per_ray`, and of `field_queries_per_ray`,
-        `proposal_queries_per_ray` and `gate_queries_per_ray`; and the median of
-        `render_seconds_per_image`.
+        Means of what `image_metrics` has for all of these images, of `samples_per_ray`, and of
+        `field_queries_per_ray`, `proposal_queries_per_ray` and `gate_queries_per_ray`; and the
+        median of `render_seconds_per_image`.
     """
     pipeline = trainer.pipeline
     pipeline.eval()
     dataset: Any = pipeline.datamanager.eval_dataset
     count = min(most_images, len(dataset))
     chosen = torch.linspace(0, len(dataset) - 1, count).round().long().tolist()
-    sums: defaultdict[str, float] = defaultdict(float)
+    found: list[dict[str, float]] = []
     times = []
     for number in chosen:
         camera = dataset.cameras[number : number + 1].to(pipeline.device)
@@ -379,7 +387,9 @@ def evaluate_images(trainer: Trainer, most_images: int, queries: Counter[str]) -
         for name in ("samples_per_ray", "num_samples_per_ray"):
             if name in outputs:
                 figures["samples_per_ray"] = float(outputs[name].float().mean())
-        for name, value in figures.items():
-            sums[name] += value / count
+        found.append(figures)
     pipeline.train()
-    return sums | {"render_seconds_per_image": statistics.median(times)}
+    # of a small image there is no LPIPS: a mean without it would be of other images
+    names = [name for name in found[0] if all(name in figures for figures in found)]
+    means = {name: statistics.fmean(figures[name] for figures in found) for name in names}
+    return means | {"render_seconds_per_image": statistics.median(times)}

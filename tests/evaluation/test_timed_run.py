@@ -29,6 +29,7 @@ from leco_plugin.evaluation.timed_run import (
     set_up,
     timed_run,
 )
+from leco_plugin.scenes.input_error import InputError
 
 RATE = 0.01
 
@@ -206,6 +207,17 @@ def test_figures_are_means_over_test_pictures_and_only_rendering_is_timed(
     assert found["render_seconds_per_image"] == middle
 
 
+def test_a_figure_that_one_picture_lacks_has_no_mean(
+    time: Time, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As LPIPS of a small picture among larger ones."""
+    lpips = iter(({"lpips": 0.4}, {}, {"lpips": 0.2}))
+    monkeypatch.setattr(module, "image_metrics", lambda *_: {"psnr": 20.0, **next(lpips)})
+    model = Renderer(time)
+    found = evaluate_images(model.trainer(), 3, model.queries)
+    assert "lpips" not in found and found["psnr"] == pytest.approx(20.0)
+
+
 class Fog(nn.Module):
     """A field that is simply called."""
 
@@ -246,7 +258,9 @@ class Run:
         where = TrainingCallbackLocation
         self.trainer: Any = SimpleNamespace(
             config=SimpleNamespace(max_num_iterations=module.ENDLESS),
-            pipeline=SimpleNamespace(model=model),
+            pipeline=SimpleNamespace(
+                model=model, datamanager=SimpleNamespace(eval_dataset=Pictures())
+            ),
             optimizers=SimpleNamespace(optimizers={}),
             callbacks=[
                 TrainingCallback([where.BEFORE_TRAIN_ITERATION], lambda step: self.begins(step)),
@@ -303,6 +317,31 @@ def test_learning_an_occupancy_is_training_time_and_looking_is_not(
     assert record.psnr == psnrs[-1]
     assert record.image_psnr == pytest.approx((18.0 - 10.0 * math.log10(2.0) + 120.0) / 2)
     assert record.train_queries["field"] == 6 * 5
+
+
+def test_points_of_a_curve_that_are_no_number_are_left_out() -> None:
+    """A run that ends with a number is stored: JSON knows no other."""
+    record = TimedRun("method", "sampler", 0, psnr=20.0, curve=[(1.0, math.nan), (2.0, 20.0)])
+    assert record.to_dict()["curve"] == [[2.0, 20.0]]
+
+
+def test_a_run_that_ends_without_a_number_has_diverged(
+    time: Time, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Run(time, nn.Module(), [40.0], monkeypatch)
+    run.psnrs = iter((math.nan,))
+    with pytest.raises(FloatingPointError, match="it has diverged"):
+        run.record()
+
+
+def test_a_scene_without_test_images_is_refused_before_the_training(
+    time: Time, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Run(time, nn.Module(), [40.0], monkeypatch)
+    run.trainer.pipeline.datamanager.eval_dataset = []
+    with pytest.raises(InputError, match="no test image"):
+        run.record()
+    assert time.now == 100.0
 
 
 def learning_model() -> Any:
