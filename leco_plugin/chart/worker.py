@@ -144,23 +144,23 @@ def compare_at_freezing(model: Any, datamanager: Any, contender: Contender) -> d
     from leco_plugin.capacity.search import gates
     from leco_plugin.capacity.sources import Source
     from leco_plugin.chart.representations import SPARSE
-    from leco_plugin.evaluation.clock import seconds_now
+    from leco_plugin.evaluation.clock import Clock
     from leco_plugin.learning.dense import evaluating
     from leco_plugin.scenes.survey import sparse_points
 
     known = {gate.key: gate for gate in gates()}
-    started = seconds_now()
-    with evaluating(model):
+    clock = Clock()
+    with clock.running(), evaluating(model):
         lesson = lesson_of(Source(datamanager, model), model.config.gate_loss)
-    of_lesson = seconds_now() - started
+    of_lesson = clock.seconds
     scores: dict[str, Any] = {}
     rows: dict[str, list[dict[str, Any]]] = {"taught": [], "others": []}
 
     def add(kind: str, name: str, make: Callable[[], Any], before: float, **facts: Any) -> None:
-        started = seconds_now()
-        scores[name] = make()
-        seconds = round(before + seconds_now() - started, 2)
-        rows[kind].append({"name": name, "seconds": seconds, **facts})
+        clock = Clock()
+        with clock.running():
+            scores[name] = make()
+        rows[kind].append({"name": name, "seconds": round(before + clock.seconds, 2), **facts})
 
     for name, key in SMALL_GATES.items():
         config = known[key].gate
