@@ -47,9 +47,9 @@ class Learned(Line):
     @property
     def healed(self) -> int | None:
         """How often a collapsed gate was, in all seeds; None where runs did not note it."""
-        stored = "occupancy.recoveries"
-        counts = [run.get("recoveries", figure_in(run, stored)) for run in self.runs]
-        total = middle_of(counts, sum)
+        names = ("recoveries", "occupancy.recoveries")  # of a host that learns first: the second
+        noted = [[figure_in(run, name) for name in names] for run in self.runs]
+        total = middle_of([its if own is None else own for own, its in noted], sum)
         return None if total is None else int(total)
 
     def figure(self, name: str) -> float | None:

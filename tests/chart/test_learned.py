@@ -40,6 +40,20 @@ def test_an_occupancy_that_is_left_of_a_gate_that_was_opened_again_is_none() -> 
     assert learned_of(lines_of(results(left))) == []
 
 
+def test_a_gate_that_a_host_learned_first_was_healed_as_often_as_its_file_says() -> None:
+    """The run of such a host notes nothing of it."""
+    runs = skipping("A", 0.5, 0.7)
+    for made, count in zip(runs, (2, 1)):
+        made["recoveries"] = None
+        made["occupancy"]["recoveries"] = count
+    (one,) = learned_of(lines_of(results(*runs)))
+    assert one.healed == 3
+    runs[0]["recoveries"] = 0  # of a model that learns itself, which goes before
+    assert one.healed == 1
+    runs[1]["occupancy"]["recoveries"] = None
+    assert one.healed is None
+
+
 def keeping(name: str, *figures: tuple[float, float]) -> list[dict]:
     """A run for each share of space kept and PSNR."""
     return [
