@@ -313,6 +313,7 @@ def forecast_minutes(
 def forecast(contenders: Iterable[Contender], protocol: Protocol, megapixels: float = SMALL) -> str:
     """How long runs take, in words: on fast cores and on slow ones."""
     given = list(contenders)
+    protocol = replace(protocol, at_once=min(protocol.at_once, max(1, len(given))))
     fast, slow = (
         max(1, round(forecast_minutes(given, protocol, cores, megapixels)))
         for cores in (FAST, SLOW)

@@ -92,6 +92,11 @@ def test_two_runs_at_a_time_take_half_as_long() -> None:
     assert forecast_minutes([GUIDED, DENSE], beside, FAST) == pytest.approx(minutes / 2)
 
 
+def test_one_run_takes_no_less_where_two_could_be_made_at_a_time() -> None:
+    alone, beside = (forecast([GUIDED], Protocol(290.0, at_once=count)) for count in (1, 2))
+    assert beside == alone == "about 5 to 6 minutes on two CPU cores, by their speed"
+
+
 def test_large_test_images_take_longer_and_longest_where_nothing_is_skipped() -> None:
     protocol = Protocol(20.0, images=3)
     small, large = (
