@@ -148,7 +148,8 @@ class Suite:
         machine = {key: fact for key, fact in self.machine.items() if key not in PER_PORTION}
         for name, scene in scenes.items():
             self.data[name] = write_scene(*scene, out / SCENES / name)
-            settings = settings_of(describe_scene(self.data[name]), self.protocol, None, machine)
+            scene_facts = describe_scene(self.data[name]) | {"digest": self.digests[name]}
+            settings = settings_of(scene_facts, self.protocol, None, machine)
             self.folders[name] = RunFolder(out / RUNS / name, settings | {"sizes": asdict(sizes)})
 
     def runner(self, scene: str) -> Runner:
@@ -181,10 +182,10 @@ class Suite:
     def estimate(self) -> str:
         """How long what is missing takes, in words."""
         todo, stored = self.missing(), list(self.stored().values())
-        seconds = core_seconds(todo, stored) / self.workers
+        at_once = max(1, min(self.workers, len(todo)))
         runs = counted(len(runs_of(self.entries)), "run")
         some = f"{len(todo)} of {runs} {by_number(len(todo), 'is', 'are')} to be made"
-        return f"{some}, {self.workers} at a time: about {spell(seconds)}"
+        return f"{some}, {at_once} at a time: about {spell(core_seconds(todo, stored) / at_once)}"
 
     def make(self, say: Say, show: Callable[[float], None], seconds: float = math.inf) -> None:
         """Makes what is missing; whenever this is stopped, what was finished is kept.
@@ -220,7 +221,8 @@ class Suite:
         except RunFailed as error:
             folder.fail(run.job, str(error))
             return f"{title}: failed: {error}"
-        folder.store(run.job, record | {"made": self.made})
+        made = self.made | record.pop("code", {})  # as its own process has loaded it
+        folder.store(run.job, record | {"made": made})
         psnr = "no PSNR" if record["psnr"] is None else f"{record['psnr']:.2f} dB"
         return f"{title}: {psnr} after {record['processor_seconds']:.0f} s"
 

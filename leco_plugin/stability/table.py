@@ -113,7 +113,9 @@ def _count_passes(results: Results) -> str:
     ours = [row["cells"].get(LEARNED, {}) for row in results["cases"] if not row["must_fail"]]
     apart = sum(cell.get("verdict") == "no reference" and cell["seeds"] > 0 for cell in ours)
     if apart:
-        parts.insert(1, f"for {apart} more it has no dense run that trains")
+        title = next(one["title"] for one in compared if one["name"] == LEARNED)
+        who = "it" if parts[0].startswith(title) else title
+        parts.insert(1, f"for {apart} more {who} has no dense run that trains")
     if missing := sum(cell["missing"] for cell in cells):
         parts.append(counted(missing, "seed of a cell is missing", "seeds of cells are missing"))
     if is_unproven(results):

@@ -5,12 +5,16 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from stability_runs import TINY, Runs, make, suite
 
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.stability import plan
 from leco_plugin.stability import suite as suite_module
 from leco_plugin.stability.cases import cases_named
+from leco_plugin.stability.photographs import grey
 from leco_plugin.stability.plan import samplers_named
 
 SAMPLERS = ("grid-128", "learned")
@@ -108,6 +112,39 @@ def test_the_time_it_takes_is_said_before_and_from_its_own_runs_later(tmp_path: 
     make(made, Runs())
     more = suite(tmp_path, ("yard",), SAMPLERS, (0, 1))
     assert more.estimate() == "3 of 6 runs are to be made, 1 at a time: about 30 s"
+
+
+def test_no_more_runs_than_there_are_are_made_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(suite_module, "usable_cores", lambda: 64)
+    made = suite(tmp_path, ("yard",), ("dense",))
+    assert made.estimate() == "1 of 1 run is to be made, 1 at a time: about 2 min"
+
+
+def test_runs_on_other_pictures_are_not_gone_on_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The scene's file has the places of its cameras, and not what they see."""
+    make(suite(tmp_path, ("yard",), ("dense",)), Runs())
+    yard = plan.STAGES["yard"]
+    repainted = replace(yard, shapes=(replace(yard.shapes[0], paint=grey(0.1)), *yard.shapes[1:]))
+    monkeypatch.setitem(plan.STAGES, "yard", repainted)
+    with pytest.raises(InputError, match="another scene"):
+        suite(tmp_path, ("yard",), ("dense",))
+
+
+def test_a_run_says_which_code_its_own_process_had(tmp_path: Path) -> None:
+    made = suite(tmp_path, ("yard",), ("dense",))
+    runs = Runs()
+
+    def later(scene: str) -> Any:
+        return lambda job, show: runs(scene)(job, show) | {"code": {"sources": "later"}}
+
+    made.runner = later  # type: ignore[method-assign]
+    made.make(lambda line: None, lambda share: None)
+    (run,) = made.results()["cases"][0]["cells"]["dense"]["runs"]
+    assert run["made"] == made.made | {"sources": "later"}
 
 
 def test_failures_are_drawn_beside_what_is_there(tmp_path: Path) -> None:

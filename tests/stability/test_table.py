@@ -73,6 +73,13 @@ def test_a_case_in_which_nobody_is_held_to_anything_is_counted_apart() -> None:
     )
 
 
+def test_a_dense_run_that_does_not_train_is_missed_by_the_sampler_that_is_held_to_it() -> None:
+    shown = results(("fog", False, {"learned": cell("no reference"), "grid-128": cell("pass")}))
+    assert headline(shown) == (
+        "grid 128³ passes 1 of 1 case; for 1 more learned occupancy has no dense run that trains"
+    )
+
+
 def test_cells_of_the_same_runs_are_counted_once() -> None:
     runs = {"runs": [{"name": "ngp-grid-128-seed-0"}]}
     grids = [{"learned": cell("pass"), "grid-128": cell("fail", **runs)} for _ in range(3)]
