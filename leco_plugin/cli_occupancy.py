@@ -55,6 +55,8 @@ def inspect(
     check_place("--json", json)
     check_picture("--picture", picture)
     check_picture("--history", history, moving=True)
+    if picture is None and (dark or data is not None):
+        raise ValueError("--data and --dark are about the picture: give --picture FILE")
     from leco_plugin.evaluation.inspection import describe, doubts, scene_of
     from leco_plugin.learning.quality import price_in_words, views_in_words
     from leco_plugin.occupancy import Occupancy

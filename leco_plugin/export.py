@@ -42,6 +42,7 @@ from leco_plugin.export_surface import (
     photograph_colours,
     require_few,
     require_not_its_own,
+    require_start,
     shown_part,
     write_ply,
     write_splat_init,
@@ -92,7 +93,7 @@ def export(
         ValueError, OSError: the file is no occupancy, a size is out of range, there is nothing to
             export, or it cannot be written there.
     """
-    _check_options(format, levels, frame)
+    _check_options(format, levels, frame, data)
     check_place("--out", out)
     occupancy = Occupancy.load(file)
     back = None if frame == "run" else to_the_data(occupancy)
@@ -110,17 +111,19 @@ def export(
             facts = write_volume(occupancy, resolution, back, out, show)
     else:
         description = scene_of(occupancy, file, data)
-        if description is not None:
+        if format == "splat-init":
+            require_start(out, description)
+        elif description is not None:
             require_not_its_own(out, description)
-        if format == "splat-init" and description is None:
-            raise ValueError("a start for splats copies transforms.json: give --data SCENE")
         surface = surface or surface_of(occupancy, resolution)
         facts = _export_points(occupancy, surface, format, out, back, description)
     known = {"format": 1, "written": format, "resolution": resolution}
     return {**known, **facts, "bytes": out.stat().st_size}
 
 
-def _check_options(format: Format, levels: int | None, frame: Frame | None) -> None:
+def _check_options(
+    format: Format, levels: int | None, frame: Frame | None, data: Path | None
+) -> None:
     """ValueError for options that do not go with a format."""
     if format != "nerfacc-grid" and levels is not None:
         raise ValueError("points have no levels: --levels goes with --format nerfacc-grid")
@@ -128,6 +131,8 @@ def _check_options(format: Format, levels: int | None, frame: Frame | None) -> N
         raise ValueError(
             "a grid lies along the axes of the run: --frame data goes with --format ply"
         )
+    if format in ("nerfacc-grid", "npz") and data is not None:
+        raise ValueError("a grid has nothing of the scene: --data goes with ply and splat-init")
     if format == "splat-init" and frame == "run":
         raise ValueError("a start for splats lies in the data: --frame run goes with --format ply")
 
@@ -307,8 +312,9 @@ def export_folder(
 
     def exported(name: str, format: Format, use: Callable[[Facts], str]) -> Part:
         def write() -> Facts:
-            known = None if format == "npz" else surface()
-            return export(file, format, folder / name, resolution, data=data, surface=known)
+            if format == "npz":
+                return export(file, format, folder / name, resolution)
+            return export(file, format, folder / name, resolution, data=data, surface=surface())
 
         return _part(folder, name, write, use)
 

@@ -238,12 +238,8 @@ def write_splat_init(
     """Writes points, and `out`, a copy of the scene's transforms.json (`description`) that names
     them: where splatfacto starts. The points lie beside the copy: the scene's sparse points that
     the occupancy keeps, and the kept surface [P, 3] in the data's coordinates. `back` [3, 4] takes
-    positions of the run to those. InputError if the copy or its points would replace the scene's
-    own, or the copy's name does not end in .json."""
-    if out.suffix != ".json":
-        raise InputError(f"--out {out}: a start for splats is a copy of transforms.json; end it so")
+    positions of the run to those."""
     points, meta = out.with_suffix(".ply"), load_json(description)
-    require_not_its_own(points, description)
     places, known = surface.double().numpy(), coloured_points(description)
     if known is None:
         colours = np.full((len(places), 3), GREY, np.uint8)
@@ -259,6 +255,17 @@ def write_splat_init(
     copy = _from_elsewhere(meta, description.parent, out.parent)
     write_json(out, copy | {"ply_file_path": points.name}, indent=1, allow_nan=True)
     return {"points": len(places), "sparse_points": sparse, "photograph_colours": known is not None}
+
+
+def require_start(out: Path, description: Path | None) -> None:
+    """InputError if `write_splat_init` has no scene to copy, or the copy or its points would
+    replace the scene's own, or the copy's name does not end in .json."""
+    if description is None:
+        raise InputError("a start for splats copies transforms.json: give --data SCENE")
+    if out.suffix != ".json":
+        raise InputError(f"--out {out}: a start for splats is a copy of transforms.json; end it so")
+    for file in (out, out.with_suffix(".ply")):
+        require_not_its_own(file, description)
 
 
 def require_not_its_own(out: Path, description: Path) -> None:

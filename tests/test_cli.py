@@ -198,6 +198,8 @@ def bad_inputs(folder: Path, file: Path) -> dict[str, list[object]]:
         "a truncated file": ["inspect", folder / "cut.safetensors"],
         "an unknown kind of picture": ["inspect", file, "--picture", folder / "picture.xyz"],
         "json where a folder is": ["inspect", file, "--json", folder / "taken"],
+        "a scene for no picture": ["inspect", file, "--data", folder],
+        "a dark page for no picture": ["inspect", file, "--dark"],
         "points with levels": [
             *("export", file, "--format", "ply", "--levels", 2, "--out", folder / "kept.ply")
         ],

@@ -150,10 +150,11 @@ def test_a_volume_is_what_the_occupancy_says_in_its_box(file: Path, tmp_path: Pa
     assert np.abs(middle - np.array(CENTRE)).max() < 0.1
 
 
-def test_what_does_not_go_together_is_refused_in_one_line(
-    file: Path, scene: Path, tmp_path: Path
+def test_what_does_not_go_together_is_refused_in_one_line_before_the_gate_is_asked(
+    file: Path, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     own = scene / "transforms.json"
+    monkeypatch.setattr("leco_plugin.export.surface_of", lambda *_: pytest.fail("asked"))
     for options, said in (
         (("splat-init", own, 24, None, None, scene), "the scene's own transforms.json"),
         (("ply", scene / "points.ply", 24, None, None, scene), "the scene's own points"),
@@ -162,6 +163,7 @@ def test_what_does_not_go_together_is_refused_in_one_line(
         (("splat-init", tmp_path / "t.json", 24), "give --data"),
         (("splat-init", tmp_path / "t.json", 24, None, "run", scene), "lies in the data"),
         (("npz", tmp_path / "v.npz", 1), "at least 2 cells"),
+        (("npz", tmp_path / "v.npz", 24, None, None, scene), "nothing of the scene"),
         (("ply", tmp_path / "k.ply", 24, None, None, tmp_path), "no transforms.json"),
     ):
         with pytest.raises(ValueError, match=said) as error:
