@@ -83,7 +83,6 @@ def inspect(
     if history is not None:
         from leco_plugin.evaluation.history_picture import draw_history
 
-        history.parent.mkdir(parents=True, exist_ok=True)
         print(f"drew {draw_history(occupancy, file.parent, history)}")
     write_report(json, facts)
 
@@ -216,7 +215,6 @@ def _draw(occupancy: Occupancy, picture: Path, description: Path | None, dark: b
     from leco_plugin.evaluation.occupancy_picture import draw
 
     colours = scene_colours(occupancy, description)
-    picture.parent.mkdir(parents=True, exist_ok=True)
     print(f"drew {draw(occupancy, picture, colours=colours, theme=DARK if dark else LIGHT)}")
     page = write_page(occupancy, picture.with_suffix(".html"), colours)
     print(f"drew {page}, to look around in with a browser")

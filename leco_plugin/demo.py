@@ -18,7 +18,7 @@ from leco_plugin.chart.contender import changed
 from leco_plugin.chart.methods import SKIPPING_NOTHING
 from leco_plugin.chart.picture import draw_curves, name_ends
 from leco_plugin.chart.summary import Line
-from leco_plugin.chart.theme import LIGHT, new_figure, save_picture, style, themed
+from leco_plugin.chart.theme import LIGHT, new_figure, save_picture, save_whole, style, themed
 from leco_plugin.evaluation.clock import Budget, forget_peaks
 from leco_plugin.evaluation.equal_loss import occupancy_facts, truth_of
 from leco_plugin.evaluation.inspection import ViewBox
@@ -236,7 +236,7 @@ def _draw_picture(trainer: Trainer, occupancy: Occupancy, truth: CityTruth, path
     axes[3].set_title(f"occupancy {SLICE_HEIGHT:.0f} m up\n(true walls white)", fontsize=12)
     for panel in axes:
         panel.set(xticks=[], yticks=[], xlabel="", ylabel="")
-    figure.savefig(path, dpi=160, bbox_inches="tight")
+    save_whole(figure, path, dpi=160, bbox_inches="tight")
 
 
 def summary(report: dict[str, Any]) -> list[str]:

@@ -17,6 +17,7 @@ from leco_plugin.chart.theme import (
     new_figure,
     plain,
     save_picture,
+    save_whole,
     style,
     themed,
 )
@@ -333,9 +334,7 @@ def draw_gates(results: Mapping[str, Any], path: Path) -> Path:
         log_axis(axes, "x", (1.0,))
         plain(axes, LIGHT)
         axes.set_title(headline(results), loc="left", fontsize=13, fontweight="bold")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=140)
-    return path
+        return save_whole(figure, path, dpi=140)
 
 
 def headline(results: Mapping[str, Any]) -> str:

@@ -90,9 +90,17 @@ def new_figure(size: tuple[float, float], page: str = LIGHT.page, **options: Any
     return figure
 
 
-def save_picture(figure: Any, path: Path, results: Any, dpi: int) -> Path:
-    figure.savefig(path, dpi=dpi, metadata={SOURCE: fingerprint(results)})
+def save_whole(figure: Any, path: Path, **options: Any) -> Path:
+    """Writes a figure, whole or not at all, as the kind of picture that its name ends in; `options`
+    are those of `savefig`."""
+    kind = path.suffix[1:].lower() or None
+    write_whole(path, lambda file: figure.savefig(file, format=kind, **options))
     return path
+
+
+def save_picture(figure: Any, path: Path, results: Any, dpi: int) -> Path:
+    """The same for a picture that says of which results it is."""
+    return save_whole(figure, path, dpi=dpi, metadata={SOURCE: fingerprint(results)})
 
 
 def fingerprint(values: Any) -> str:

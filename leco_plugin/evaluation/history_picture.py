@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from leco_plugin.chart.theme import LIGHT, new_figure, plain
+from leco_plugin.chart.theme import LIGHT, new_figure, plain, save_whole
 from leco_plugin.evaluation.inspection import cameras_of
 from leco_plugin.evaluation.occupancy_picture import (
     HORIZONTAL,
@@ -25,6 +25,7 @@ from leco_plugin.learning.history import FILE_NAME, GateHistory, as_learned
 from leco_plugin.log import bar
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.whole_files import write_whole
 
 STILL, MOST_FRAMES = 4, 12
 """Looks in a still picture of a history, and in one that moves."""
@@ -51,8 +52,7 @@ def draw_history(occupancy: Occupancy, folder: Path, path: Path) -> Path:
     film = _Film(occupancy, _read(occupancy, folder))
     count = len(film.history)
     if path.suffix.lower() != ".gif":
-        film.still(spread_evenly(count, STILL)).savefig(path, dpi=DPI)
-        return path
+        return save_whole(film.still(spread_evenly(count, STILL)), path, dpi=DPI)
     frames = []
     shown = spread_evenly(count, MOST_FRAMES)
     with bar("Drawing how it was learned") as progress:
@@ -82,7 +82,8 @@ def write_film(
     tree = Image.Quantize.FASTOCTREE  # the others mix the colours of thin lines with their paper
     palette = strip.quantize(colours, method=tree, dither=Image.Dither.NONE)
     few = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    few[0].save(path, save_all=True, append_images=few[1:], duration=durations, loop=0)
+    options: dict[str, Any] = {"save_all": True, "append_images": few[1:], "loop": 0}
+    write_whole(path, lambda file: few[0].save(file, "GIF", duration=durations, **options))
 
 
 def spread_evenly(count: int, most: int) -> list[int]:

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from leco_plugin.chart.theme import LIGHT, Theme, new_figure, themed
+from leco_plugin.chart.theme import LIGHT, Theme, new_figure, save_whole, themed
 from leco_plugin.evaluation.inspection import (
     SceneColours,
     ViewBox,
@@ -22,7 +22,6 @@ from leco_plugin.evaluation.inspection import (
     whole_box,
 )
 from leco_plugin.occupancy import CALIBRATED_AT, Occupancy
-from leco_plugin.scenes.whole_files import write_whole
 
 Array = NDArray[Any]
 
@@ -68,11 +67,8 @@ def draw(
     Raises:
         OSError, ValueError: the picture cannot be written there, or is of no known kind.
     """
-    kind = Path(path).suffix[1:].lower()
     with themed(theme, TYPE):
-        figure = _figure(occupancy, cameras, colours, theme)
-        write_whole(Path(path), lambda file: figure.savefig(file, format=kind or None, dpi=DPI))
-    return Path(path)
+        return save_whole(_figure(occupancy, cameras, colours, theme), Path(path), dpi=DPI)
 
 
 def _figure(

@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 from leco_plugin.chart.table import rows
-from leco_plugin.chart.theme import LIGHT, Theme, new_figure, save_picture
+from leco_plugin.chart.theme import LIGHT, Theme, new_figure, save_picture, save_whole
 from leco_plugin.log import counted
 from leco_plugin.stability.plan import LEARNED, QUICK
 
@@ -254,4 +254,4 @@ def draw_side_by_side(pictures: Mapping[str, Path], title: str, path: Path) -> N
         axes.imshow(pixels[..., :3] * alpha + 1.0 - alpha, interpolation="nearest")
         axes.set_title(name, fontsize=10, loc="left", pad=4)
         axes.axis("off")
-    figure.savefig(path, dpi=110)
+    save_whole(figure, path, dpi=110)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -32,6 +34,22 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     history.save(tmp_path)
     ball().save(tmp_path / "occupancy.safetensors")
     return tmp_path
+
+
+def test_a_film_that_a_full_disk_cuts_off_replaces_no_older_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def cut_off(_: Image.Image, target: Any, *__: Any, **___: Any) -> None:
+        with nullcontext(target) if hasattr(target, "write") else Path(target).open("wb") as out:
+            out.write(b"half")
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(Image.Image, "save", cut_off)
+    film = tmp_path / "a.gif"
+    film.write_bytes(b"older")
+    with pytest.raises(OSError, match="No space left"):
+        history_picture.write_film([Image.new("RGB", (4, 4))] * 2, film, 250, 8)
+    assert film.read_bytes() == b"older" and [*tmp_path.iterdir()] == [film]
 
 
 def test_a_gif_has_a_frame_for_each_look_and_rests_on_the_last(run: Path) -> None:

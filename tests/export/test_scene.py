@@ -15,6 +15,7 @@ import trimesh
 from ball_occupancy import CENTRE, RADIUS, ball
 from scipy.spatial.transform import Rotation
 
+from leco_plugin.chart.theme import new_figure, save_picture
 from leco_plugin.evaluation.occupancy_picture import draw
 from leco_plugin.export import export, export_folder, in_words
 from leco_plugin.occupancy import Occupancy
@@ -268,6 +269,10 @@ def test_a_picture_that_a_full_disk_cuts_off_replaces_no_older_one(
     picture.parent.mkdir()
     picture.write_bytes(b"older")
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", cut_off)
-    with pytest.raises(OSError, match="No space left"):
-        draw(Occupancy.load(file), picture)
-    assert picture.read_bytes() == b"older" and [*picture.parent.iterdir()] == [picture]
+    for save in (
+        lambda: draw(Occupancy.load(file), picture),
+        lambda: save_picture(new_figure((1.0, 1.0)), picture, {}, 10),
+    ):
+        with pytest.raises(OSError, match="No space left"):
+            save()
+        assert picture.read_bytes() == b"older" and [*picture.parent.iterdir()] == [picture]
