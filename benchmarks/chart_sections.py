@@ -68,8 +68,13 @@ def notes() -> dict[str, str]:
     return noted(RESULTS)
 
 
+def star(*names: str) -> str:
+    """The mark behind what is said of stored results if there is a note on any of them."""
+    return " (*)" if notes().keys() & set(names) else ""
+
+
 def chart_sections() -> list[str]:
-    """Charts of `docs/results.md`: those that belong to no suite."""
+    """Charts of `docs/measurements.md`: those that belong to no suite."""
     return _sections(of_suites=False)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import checkout  # noqa: F401
-from chart_sections import longer, stored, titles
+from chart_sections import longer, star, stored, titles
 from page_parts import RESULTS, between, heading_anchor, noted, table
 from walk import with_walk
 
@@ -16,6 +16,7 @@ from leco_plugin.chart.learned import last_gain
 from leco_plugin.chart.summary import Line, compare, describe_seeds, lines_of
 from leco_plugin.evaluation.report import describe_cores
 from leco_plugin.learning.calibration import in_decibels
+from leco_plugin.log import counted
 
 DEMO = "<!-- demo: generated -->", "<!-- end of the demo -->"
 GAIN = "<!-- gain: generated -->", "<!-- end of the gain -->"
@@ -59,11 +60,14 @@ def gain(*also: str) -> str:
 
 def after_half_an_hour() -> str:
     """What is left of the gain of the paper's model when there is time."""
-    here, there = (lines_of(stored(name)) for name in HALF_HOUR_CHARTS.values())
+    names = HALF_HOUR_CHARTS.values()
+    here, there = (lines_of(stored(name)) for name in names)
+    seeds = " and ".join(dict.fromkeys(describe_seeds(stored(name)) for name in names))
+    old = ", made before a later change of the code" if star(*names) else ""
     return (
         f"**After half an hour** LeCO has {here[0].psnr:.1f} dB with a learned occupancy, "
         f"{here[1].psnr:.1f} without a gate; on a city {there[0].psnr:.1f} and {there[1].psnr:.1f} "
-        "(one seed each)."
+        f"({seeds} each{old})."
     )
 
 
@@ -92,27 +96,30 @@ def half_an_hour() -> str:
         ours, other = lines = lines_of(stored(name))
         ends = [f"{line.psnr:.1f} dB ({last_gain(line):+.1f})" for line in lines]
         passed = ours.seconds_to(other.psnr)
-        sooner = "" if passed is None else f"; the first had passed the second by {passed:.0f} s"
+        sooner = "" if passed is None else f"; after {passed:.0f} s the first had as much"
         parts.append(
-            f"on {place} {ends[0]} with a learned occupancy, {ends[1]} as *{other.name}*{sooner} "
-            f"([figures](measurements.md#{heading_anchor(titles()[name])}))"
+            f"on {place} {ends[0]} with a learned occupancy, {ends[1]} as *{other.name}* "
+            f"({compare(ours.psnrs, other.psnrs).said()}){sooner} "
+            f"([figures](measurements.md#{heading_anchor(titles()[name])})){star(name)}"
         )
     return (
-        "**After half an hour** of one core LeCO has, with one seed each, so without a verdict, "
-        f"{'; '.join(parts)}. In brackets what the last ten minutes brought."
+        f"**After half an hour** of one core LeCO has {'; '.join(parts)}. In brackets behind each "
+        "PSNR what the last third of the time brought."
     )
 
 
 def without_gifts(results: Mapping[str, Any]) -> str:
     """What a learned row of the gain has without what else it gets beside its gate."""
     whole, without, own = lines_of(results)
-    failed = [psnr for psnr in without.psnrs if psnr < min(own.psnrs) - FAILED]
-    ended = " and ".join(f"{psnr:.1f}" for psnr in without.psnrs if psnr not in failed)
-    count = f", and {len(failed)} failed" if failed else ""
+    ended = [psnr for psnr in without.psnrs if psnr >= min(own.psnrs) - FAILED]
+    failed = len(without.psnrs) - len(ended)
+    alone = f"{failed} of {counted(len(without.psnrs), 'run')} failed"
+    if ended:
+        alone = f"at {listed(ended)}" + (f" ({alone})" if failed else "")
     return (
         "**Part of Instant-NGP's lead** is how its run begins. In another test, of "
-        f"{len(whole.psnrs)} seeds, runs end at {_psnrs(whole)} dB with all of it, at {ended} with "
-        f"gate and bounds alone{count}, at {_psnrs(own)} with its own grid "
+        f"{len(whole.psnrs)} seeds, runs end at {listed(whole.psnrs)} dB with all of it; with gate "
+        f"and bounds alone {alone}; with its own grid at {listed(own.psnrs)} "
         "([more](docs/results.md#what-is-gained-in-the-same-time))."
     )
 
@@ -187,7 +194,8 @@ def gain_table(results: Mapping[str, Any]) -> str:
     words = (
         "A query asks a network about one point; *small* ones ask a proposal network or a gate. "
         "*LeCO* is the paper's model: several small networks, the *experts*. A *host* is a method "
-        "that an occupancy guides. *Long steps* take fewer samples of each ray."
+        "that an occupancy guides. *Long steps* take fewer samples of each ray. PSNR is a mean "
+        "over seeds, with the least and the most; the others are medians."
     )
     columns = f"{head} | PSNR | to render an image | queries a ray"
     return "\n".join([*table(columns, rows), "", words])
@@ -201,7 +209,7 @@ def in_the_same_time(results: Mapping[str, Any], most: int | None = None) -> str
 
 def gifts_sentence(results: Mapping[str, Any], anchor: str) -> str:
     """What a learned row gets beside its gate is worth, seed by seed."""
-    learned, without, own = map(_psnrs, lines_of(results))
+    learned, without, own = (listed(line.psnrs) for line in lines_of(results))
     return (
         "The learned row of Instant-NGP gets more than a gate: an opaque start, a careful one, "
         f"bounds and distances of sparse points. [Seed by seed](measurements.md#{anchor}), after "
@@ -239,9 +247,9 @@ def _beside(ours: Line, rival: Line, host: str) -> str:
     return f"{word} *{name}* by {by} {margin} (renders {faster if times >= 1.0 else slower})"
 
 
-def _psnrs(line: Line) -> str:
-    """Of each run, the best first."""
-    return ", ".join(f"{psnr:.1f}" for psnr in sorted(line.psnrs, reverse=True))
+def listed(psnrs: Sequence[float]) -> str:
+    """Some PSNRs, the best first."""
+    return ", ".join(f"{psnr:.1f}" for psnr in sorted(psnrs, reverse=True))
 
 
 def _queries(line: Line) -> str:

@@ -74,7 +74,8 @@ What was found, in one page. Behind it are [Measurements](measurements.md), ever
 with [how to read them](measurements.md#how-to-read-a-table), [Suites](suites.md), the charts of the
 reviewers' questions, and [Who gets what](gifts.md) in a comparison. All is made from
 `benchmarks/results/*.json` by `python benchmarks/results_page.py`; a test fails when they differ.
-Where (*) stands, older code has made the figure; the page of its figures says what has changed.
+Those pages say of which commit each figure is. Where (*) stands, a later change of the code is
+known to matter; the page of its figures says which.
 
 ## What is gained in the same time
 """

@@ -12,7 +12,6 @@ import chart_sections as sections
 import growth_picture
 import learning
 import pytest
-import readme_parts as parts
 from chart_results import occupancy, results, run
 from eight_questions import eight_answers
 from results_page import sampling_section
@@ -196,92 +195,6 @@ def test_a_chart_with_a_note_is_marked(store: Store, tmp_path: Path) -> None:
     store("freeze", "city", run("A"))
     (tmp_path / "notes.json").write_text('{"city-freeze": "Made before."}')
     assert "[city](#suite-freeze-on-city) (*) |" in answered()
-
-
-def test_the_gain_is_that_over_each_other_row_of_the_same_host() -> None:
-    def of(method: str, sampler: str, psnr: float, queries: tuple[float, float, float]) -> Any:
-        names = ("field", "proposal", "gate")
-        asked = {f"{one}_queries_per_ray": many for one, many in zip(names, queries)}
-        render = {"render_seconds_per_image": 0.1 * sum(queries)}
-        name = f"{method} + {sampler}"
-        return run(name, psnr=psnr, method=method, sampler=sampler, **asked, **render)
-
-    runs = [
-        of("leco-occupancy", "learned-occupancy", 28.0, (15.0, 0.0, 5.0)),
-        of("leco-occupancy", "dense", 29.0, (40.0, 0.0, 0.0)),
-        of("leco-ngp", "own", 24.0, (50.0, 0.0, 0.0)),
-        of("leco-nerfacto", "own", 25.0, (32.0, 48.0, 0.0)),
-    ]
-    chart = {
-        "runs": runs,
-        "protocol": {"seconds": 120.0, "at_once": 2},
-        "scene": {"name": "fox"},
-        "machine": {"cores": 4, "threads": 2, "device": "cpu"},
-    }
-    head, _, ours, *_, words = parts.gain_table(chart).splitlines()
-    assert head == (
-        "| `fox`, 120 s on 2 CPU cores, one seed | PSNR | to render an image | queries a ray |"
-    )
-    assert ours == (
-        "| **leco-occupancy + learned-occupancy** | 28.0 dB (28.0 to 28.0) | 2.0 s | 15 + 5 small |"
-    )
-    told = "**In the same time,** with a learned occupancy, "
-    alone = (
-        "leco-occupancy is beside *dense* by -1.0 dB, one seed: no verdict (renders 2.0 times as "
-        "fast)."
-    )
-    assert parts.in_the_same_time(chart) == f"{told}{alone}"
-    assert words.startswith("A query asks a network about one point;")
-    guided = [
-        of("leco-nerfacto", "learned-occupancy", 30.0 + 0.1 * seed, (32.0, 0.0, 8.0))
-        | {"seed": seed}
-        for seed in range(3)
-    ]
-    own = [
-        of("leco-nerfacto", sampler, psnr + 0.1 * seed, (32.0, 48.0, 0.0)) | {"seed": seed}
-        for sampler, psnr in (("own", 25.0), ("long-steps", 30.1), ("dense", 31.0))
-        for seed in range(3)
-    ]
-    assert parts.in_the_same_time(chart | {"runs": [*runs[:3], *guided, *own]}) == (
-        f"{told}leco-nerfacto is behind *dense* by 1.0 ± "
-        "0.2 dB (renders 2.0 times as fast) and level with *long-steps* by -0.1 ± 0.2 dB (renders "
-        "2.0 times as fast) and ahead of *own* by 5.0 ± 0.2 dB (renders 2.0 times as fast). "
-        f"{alone}"
-    )
-
-
-def test_the_gain_says_how_many_runs_failed() -> None:
-    failed = [{"name": "LeCO + own", "seed": 1, "reason": "no memory"}]
-    ours = [run("LeCO + learned-occupancy", seed, gate_queries_per_ray=1.0) for seed in (0, 1)]
-    own = run("LeCO + own", sampler="own", gate_queries_per_ray=0.0)
-    text = parts.gain_table(results(*ours, own, failures=failed))
-    assert "| `city`, 10 s on 2 CPU cores, 1 to 2 seeds; 1 run failed | PSNR |" in text
-
-
-def test_the_readme_says_that_its_chart_was_made_before_a_mend(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(sections, "CHARTS", ROOT / "benchmarks" / "results" / "charts")
-    monkeypatch.setattr(parts, "noted", lambda folder: {parts.GAIN_CHART: "Made before."})
-    text = (Path(__file__).parent.parent / "README.md").read_text()
-    assert f"\n\nMade before.\n{parts.GAIN[1]}" in parts.readme(text)
-
-
-def test_what_is_around_the_tables_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parts, "stored", lambda name: {})
-    monkeypatch.setattr(parts, "demo_sentence", lambda report: "demo")
-    monkeypatch.setattr(parts, "with_walk", lambda text, names: text)
-    monkeypatch.setattr(parts, "lead", lambda chart: "lead")
-    monkeypatch.setattr(parts, "gain_table", lambda chart: "table")
-    monkeypatch.setattr(parts, "in_the_same_time", lambda chart, most=None: "gain")
-    monkeypatch.setattr(parts, "without_gifts", lambda chart: "alone")
-    monkeypatch.setattr(parts, "after_half_an_hour", lambda: "late")
-    monkeypatch.setattr(parts, "of_the_papers_host", lambda: "")
-    (before, after), (begin, end) = parts.DEMO, parts.GAIN
-    text = f"A\n{before}\nstale\n{after}\nB\n{begin}\n{end}\nC\n"
-    parts_of_gain = "lead\n\ntable\n\n- gain\n- alone\n- late"
-    expected = f"A\n{before}\ndemo\n{after}\nB\n{begin}\n{parts_of_gain}\n{end}\nC\n"
-    assert parts.readme(text) == expected
 
 
 def test_a_suite_is_shown_with_its_question_picture_figures_command_and_machine(
