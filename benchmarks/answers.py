@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import checkout  # noqa: F401
-from chart_sections import by_scene, notes
+from chart_sections import by_scene, star
 from page_parts import size, table
 
 from leco_plugin.chart.learned import (
@@ -68,18 +69,17 @@ def answers_section() -> list[str]:
 
 
 def _answer(charts: Sequence[tuple[str, dict[str, Any]]]) -> list[str]:
-    noted = notes()
     kinds = [_kind(results) for _, results in charts]
     figures, cells_of = next((kind for kind in kinds if kind[0] == KEPT), kinds[0])
     cells = [cells_of(lines_of(results)) for _, results in charts]
     columns = list(dict.fromkeys(column for row in cells for column in row))
     rows = []
     for (name, results), row in zip(charts, cells):
-        scene = _link(results) + (" (*)" if name in noted else "")
+        scene = _link(results) + star(name)
         shown = [row.get(column, "-") for column in columns]
         rows.append([scene, *shown, _answer_of(results), str(results["made"]["date"])])
-    counted = f"{in_short([results for _, results in charts])}\n"
-    return [figures, *table(f"scene | {' | '.join(columns)} | | made", rows), "", counted]
+    short = f"{in_short([results for _, results in charts])}\n"
+    return [figures, *table(f"scene | {' | '.join(columns)} | | made", rows), "", short]
 
 
 def in_short(charts: Sequence[Mapping[str, Any]]) -> str:
@@ -87,20 +87,32 @@ def in_short(charts: Sequence[Mapping[str, Any]]) -> str:
     figures = {_kind(results)[0] for results in charts}
     if KEPT in figures:
         return _fronts(charts)
-    of = scenes_of(charts)
     if LEARNED in figures:
         best = sum(_none_is_better(learned_of(lines_of(results))) for results in charts)
         return (
-            f"On {best} of {of}, no other is better than ours in space kept and in PSNR beyond the "
-            "spread of seeds."
+            f"On {best or 'none'} of {scenes_of(charts)} the seeds show no other ahead of ours in "
+            "space kept or PSNR that is not behind it in the other."
         )
-    words = [_word(lines_of(results)) for results in charts]
-    ahead, level, unknown, behind = map(words.count, ("ahead", "level", "undecided", "behind"))
     ours = sentence(lines_of(charts[0])[0].name)
-    counts = {"level with it": level, "behind it": behind, "undecided": unknown}
-    rest = [f"{word} on {count}" for word, count in counts.items() if count]
-    said = f"*{ours}* is ahead of the best other on {ahead or 'none'} of {of}"
-    return ", ".join([said, *rest]) + "."
+    words = standing(_word(lines_of(results)) for results in charts)
+    return f"*{ours}* is ahead of the best other {words}."
+
+
+STANDINGS = {
+    "level": "level with it",
+    "behind": "behind it",
+    "undecided": "undecided",
+    None: "without a verdict",
+}
+"""Words for how it stands beside another where it is not ahead."""
+
+
+def standing(words: Iterable[str | None]) -> str:
+    """On how many scenes one is ahead of another, and how it stands on the rest."""
+    counts = Counter(words)
+    of = counted(counts.total(), "scene")
+    rest = [f"{said} on {counts[word]}" for word, said in STANDINGS.items() if counts[word]]
+    return ", ".join([f"on {counts['ahead'] or 'none'} of {of}", *rest])
 
 
 def scenes_of(charts: Sequence[Any]) -> str:
@@ -109,14 +121,14 @@ def scenes_of(charts: Sequence[Any]) -> str:
 
 
 def _none_is_better(learned: Sequence[Learned]) -> bool:
-    """Whether ours was measured and no other is ahead in space and PSNR, or in one and level."""
+    """Whether ours was measured, with a verdict on all others, and none is ahead of it in space or
+    PSNR without being behind in the other."""
     ours = ours_of(learned)
     if ours is None or not ours.is_measured:
         return False
     rivals = [one for one in learned if one is not ours and one.is_measured]
-    return not any(
-        "ahead" in (said := words_of(one, ours)) and "behind" not in said for one in rivals
-    )
+    found = [words_of(one, ours) for one in rivals]
+    return not any(None in said or ("ahead" in said and "behind" not in said) for said in found)
 
 
 def _word(lines: Sequence[Line]) -> str | None:

@@ -15,8 +15,8 @@ from typing import Any
 import checkout  # noqa: F401
 from answers import answers_section
 from bars import bars_section
-from chart_sections import chart_sections, stored, suite_sections, titles
-from eight_questions import eight_answers
+from chart_sections import chart_sections, star, stored, suite_sections, titles
+from eight_questions import eight_answers, scenes_and_seeds
 from growth_picture import cities, growth_table
 from large_scene_tables import LARGE_SCENES
 from learning import sentence as learning_sentence
@@ -26,7 +26,6 @@ from page_parts import (
     heading_anchor,
     machine_line,
     made_line,
-    noted,
     picture,
     section,
     table,
@@ -94,7 +93,7 @@ The demo's city is known exactly, which photographs never are:
 """
 QUESTIONS = """## The reviewers' questions, answered
 
-Four scenes a question, three seeds; [Suites](suites.md#the-answers-with-their-figures) has them
+The first six are of {scenes_and_seeds}. [Suites](suites.md#the-answers-with-their-figures) has them
 scene by scene. In question 5 the host is Switch-NeRF, in the others it is the paper's model.
 """
 MORE = """## Further
@@ -297,13 +296,13 @@ def page() -> str:
     parts += [
         f"{demo_table(demo)}\n",
         *bars_section(RESULTS),
-        QUESTIONS,
+        QUESTIONS.format(scenes_and_seeds=scenes_and_seeds()),
         *eight_answers(scene_results("capacity")),
         "",
     ]
     stability = json.loads((RESULTS / "stability.json").read_text())
     found = {
-        "star": " (*)" if "capacity" in noted(RESULTS) else "",
+        "star": star("capacity"),
         "capacity": where_it_pays(scene_results("capacity")),
         "grids": kept_by_grids(json.loads((RESULTS / "sharpening.json").read_text())),
         "stability": sentence(headline(stability)),

@@ -94,8 +94,44 @@ def test_eight_questions_have_an_answer_each_or_are_not_measured(store: Store) -
     store("freeze", "fox", *runs, **timed)
     answer = eight_answers(REPORTS)[3]
     assert answer.startswith("4. **Why freeze, and go on with the same network?** Going on ends ")
-    assert "+1.5 dB above a start from scratch, and -1.0 dB above a gate that is" in answer
+    assert "+1.5 dB above a new start (ahead on 1 of 1 scene), and -1.0 dB above a" in answer
+    assert "frozen (ahead on none of 1 scene, behind it on 1). *Learn" in answer
     assert answer.endswith("ahead of the best other on none of 1 scene, behind it on 1.")
+
+
+def test_a_comparison_of_one_seed_is_counted_as_without_a_verdict(store: Store) -> None:
+    for number, scene in enumerate(("city", "fox")):
+        runs = [run(name, seed, psnr=20.0 + seed) for name in "AB" for seed in range(number + 1)]
+        store("freeze", scene, *runs)
+    assert "best other on none of 2 scenes, undecided on 1, without a verdict on 1." in answered()
+    store("losses", "fox", run("A (ours)", occupancy=occupancy(5, 0.1)), run("B"), **STEPS)
+    assert "On 1 of 1 scene the seeds show no other ahead of ours" in answered()
+    held = {"occupancy": occupancy(5, 0.2)}
+    store("losses", "fox", run("A (ours)", **held), run("B", **held), **STEPS)
+    assert "On none of 1 scene the seeds show no other ahead of ours" in answered()
+
+
+def test_small_gates_are_compared_where_there_are_any_and_with_one_grid_too(store: Store) -> None:
+    def first() -> str:
+        return eight_answers(REPORTS)[0]
+
+    store("representations", "city", *representations(10.0), **STEPS)
+    assert first().endswith("The small MLP was not measured.")
+    runs = representations(10.0)
+    at_equal_loss = runs[0]["occupancy"]["at_equal_loss"]
+    taught = {"bytes": 4932, "seconds": 9.0, "kept_reached_volume": 0.05}
+    at_equal_loss["taught"] = [{"name": "MLP", **taught}]
+    full = {"bytes": 0, "seconds": 1.0, "kept_reached_volume": 1.0, "learned_first": True}
+    at_equal_loss["others"] = [{"name": "taught grid 256³", **full}]
+    store("representations", "fox", *runs, **STEPS)
+    assert "** Small MLP (ours) keeps least on every scene. A small MLP of 4.9 kB that" in first()
+    assert (
+        "keeps 5.0% of the space at equal loss in 1 scene; grids of densities of 33 kB" in first()
+    )
+    assert first().endswith(
+        "keep 6.0 times as much. Sizes of grids are of octrees, on `city`, `fox` a bit a cell. "
+        "Left out, for keeping all in some run: taught grid 256³ on `fox`."
+    )
 
 
 def test_it_is_said_for_every_scene_whether_ours_is_on_the_fronts(store: Store) -> None:
