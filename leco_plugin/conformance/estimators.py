@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-from itertools import zip_longest
+import itertools
 from typing import Any
 
 import torch
@@ -29,6 +29,7 @@ from leco_plugin.conformance.scene import (
     MARGIN,
     NOTHING,
     PARTS,
+    SHORT_STEP,
     SLAB,
     STEP,
     TWO,
@@ -47,6 +48,7 @@ from leco_plugin.conformance.scene import (
     render,
     same,
     stretched,
+    within,
     without_samples,
 )
 from leco_plugin.occupancy import Occupancy
@@ -116,7 +118,7 @@ def signature(case: EstimatorCase) -> None:
     takes_anything = {inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD}
     if not takes_anything <= {parameter.kind for parameter in offered}:
         wanted = list(inspect.signature(Estimator.sampling).parameters.values())[1:]
-        for number, (given, found) in enumerate(zip_longest(wanted, offered), 1):
+        for number, (given, found) in enumerate(itertools.zip_longest(wanted, offered), 1):
             if given is None:
                 break
             fits = found is not None and (found.name, found.default) == (given.name, given.default)
@@ -269,6 +271,7 @@ def skips_only_what_it_may(case: EstimatorCase) -> None:
         for scene, step, rays in (
             (SLAB, STEP, crossing()),
             (SLAB, STEP, stretched()),
+            (SLAB, STEP, within()),
             (TWO, LONG_STEP, crossing(MANY)),
         ):
             sampler = case.shared(scene).train(training)
@@ -322,17 +325,25 @@ def _first(positions: Tensor) -> str:
 @checks("all-kept-equals-dense", "estimator")
 def all_kept_equals_dense(case: EstimatorCase) -> None:
     """Where everything is occupied, samples are those of the ray-marching rule without skipping."""
-    rays, sampler = crossing(), case.shared(EVERYTHING)
-    for cone_angle in (0.0, CONE_ANGLE):
-        samples = case.sample(sampler, rays, cone_angle=cone_angle)
+    rays, few, sampler = crossing(), crossing(4), case.shared(EVERYTHING)
+    for training, cone_angle in itertools.product((False, True), (0.0, CONE_ANGLE)):
+        options: dict[str, Any] = {"cone_angle": cone_angle, "stratified": False}
+        samples = case.sample(sampler.train(training), rays, **options)
         expected = dense(rays, cone_angle)
         missing = int((~among(expected, samples)).sum())
         extra = int((~among(samples, expected)).sum())
         require(
             missing + extra <= ALLOWED_DIFFERENCE * len(expected[0]),
-            f"with cone_angle {cone_angle:g} {missing} of {len(expected[0])} candidates are "
-            f"missing, {extra} samples are none of them",
+            f"with cone_angle {cone_angle:g}{', in training without stratified,' * training} "
+            f"{missing} of {len(expected[0])} candidates are missing, {extra} samples are none of "
+            "them",
         )
+    found = len(case.sample(sampler.eval(), few, render_step_size=SHORT_STEP)[0])
+    count = len(dense(few, step=SHORT_STEP)[0])
+    require(
+        abs(found - count) <= ALLOWED_DIFFERENCE * count,
+        f"of {count} candidates on {len(few.origins)} rays {found} are sampled",
+    )
 
 
 @checks("update-while-frozen-is-harmless", "estimator")

@@ -21,7 +21,7 @@ from leco_plugin.conformance.hosts import (
 )
 from leco_plugin.conformance.proposals import CHORD, INSIDE, NEARBY, chords
 from leco_plugin.conformance.rules import checks, raises_nothing, require
-from leco_plugin.conformance.samplers import check_tensor, devices
+from leco_plugin.conformance.samplers import check_tensor, devices, of_two_seeds
 from leco_plugin.conformance.scene import (
     AROUND,
     DISTANCE,
@@ -172,7 +172,7 @@ def _check_picture(name: str, image: Tensor) -> None:
 def same_image_in_eval(case: HostCase) -> None:
     """Evaluation does not depend on random numbers."""
     model = case.shared()
-    one, other = (rendered(model, bundle(), seed) for seed in (1, 2))
+    one, other = of_two_seeds(lambda seed: rendered(model, bundle(), seed))
     for name, value in one.items():
         require(value.equal(other[name]), f"two evaluations of the same rays differ in {name!r}")
 

@@ -35,6 +35,7 @@ from leco_plugin.conformance.scene import (
     cut_short,
     leaving,
     same,
+    within,
     without_samples,
 )
 from leco_plugin.log import counted
@@ -229,6 +230,7 @@ def skips_only_what_it_may(case: ProposalCase) -> None:
     """Samples gather in what is kept, from where a ray enters it to where it leaves."""
     for training in (False, True):
         _check_gathered(case, case.shared(SLAB).train(training))
+    _check_gathered(case, case.shared(SLAB), within())
     if case.needs_occupancy:
         _check_gathered(case, _in_other_coordinates(case).eval())
         _check_gathered(case, case.shared(AROUND), leaving(), AROUND)

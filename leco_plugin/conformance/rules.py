@@ -192,7 +192,7 @@ RULES = (
         "deterministic-in-eval",
         "a test image must not change from one rendering to the next, nor a figure with it.",
         "draw random numbers only when stratified is set (estimator) or self.training is "
-        "(proposal).",
+        "(proposal), and set no seed.",
     ),
     Rule(
         "stratified-in-training",
@@ -272,7 +272,7 @@ RULES = (
         "same-image-in-eval",
         "a test image must not change from one rendering to the next, nor a figure with it.",
         "draw random numbers (noise, jitter, backgrounds) only while self.training is set, "
-        "in the host and in its sampler.",
+        "in the host and in its sampler; set no seed.",
     ),
     Rule(
         "samples-shift-in-training",

@@ -136,8 +136,17 @@ def check_gradients(field: Field, why: str) -> None:
 def deterministic_in_eval(case: SamplerCase) -> None:
     """Evaluation does not depend on random numbers."""
     sampler, rays = case.shared(SLAB), crossing()
-    one, other = (case.sample(sampler, rays, seed=seed) for seed in (1, 2))
+    one, other = of_two_seeds(lambda seed: case.sample(sampler, rays, seed=seed))
     require(same(one, other), "two calls in evaluation mode return different samples")
+
+
+def of_two_seeds(evaluate: Callable[[int], Any]) -> tuple[Any, Any]:
+    """What an evaluation returns with random numbers from two seeds. Raises if it sets a seed of
+    its own: training would go on with the same numbers after each test image."""
+    one, after_one = evaluate(1), torch.get_rng_state()
+    other, after_other = evaluate(2), torch.get_rng_state()
+    require(not after_one.equal(after_other), "evaluation sets the seed of torch's random numbers")
+    return one, other
 
 
 def check_shifts(case: SamplerCase) -> None:
@@ -175,6 +184,7 @@ def state_dict_round_trip(case: SamplerCase) -> None:
     """The checkpoint of one scene turns a sampler of another scene into the first."""
     source, rays = case.shared(EVERYTHING), crossing()
     restored = case.build(OTHER.occupancy(case.gate_encoding) if case.needs_occupancy else None)
+    case.sample(restored.eval(), rays, OTHER)  # what is derived at first use is of the other scene
     restored.load_state_dict(reloaded(source.state_dict()))
     samples = case.sample(restored.eval(), rays, EVERYTHING)
     require(

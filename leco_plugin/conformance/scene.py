@@ -37,8 +37,9 @@ DISTANCE = 2.0 * HALF
 """From the centre of the box to every ray's origin."""
 FAR_AWAY = 4.0 * DISTANCE
 """From the origins of rays that leave the box to their ends."""
-STEP, LONG_STEP = 0.05, 0.25
-"""World units. With long steps a ray has one or two samples in each part of `TWO`."""
+STEP, LONG_STEP, SHORT_STEP = 0.05, 0.25, 0.0015
+"""World units. With long steps a ray has one or two samples in each part of `TWO`, with short ones
+some two thousand in the box."""
 MANY = 20_000
 """Rays of a batch as a host on a GPU has it: what goes wrong on few rays, or in pieces, shows."""
 MARGIN = 0.08
@@ -97,6 +98,20 @@ def cut_short(n_rays: int = 48) -> Rays:
     rays = crossing(n_rays)
     spread = torch.linspace(0.0, 0.4, len(rays.t_min))
     return rays._replace(t_min=DISTANCE - 0.8 + spread, t_max=DISTANCE + 0.8 - spread)
+
+
+@functools.cache
+def within() -> Rays:
+    """Rays that begin inside the box and end outside, as in a room; the first six along the axes,
+    where others divide by a direction's zeros."""
+    rays = cut_short()
+    axes = torch.cat([torch.eye(3), -torch.eye(3)])
+    return Rays(
+        rays.origins + rays.directions * rays.t_min[:, None],
+        torch.cat([axes, rays.directions[len(axes) :]]),
+        torch.full_like(rays.t_min, 0.05),
+        torch.full_like(rays.t_max, 2.0 * DISTANCE),
+    )
 
 
 @functools.cache

@@ -1,13 +1,17 @@
-"""Estimators that are broken only in large batches, in training, or between slabs."""
+"""Estimators that are broken only in large batches, in training, between slabs, or for some rays
+and calls.
+"""
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import torch
 from conformance.estimator_mutants import SKIPS, Answers, Sound
 from torch import Tensor
 
+from leco_plugin.conformance.scene import box
 from leco_plugin.samplers.marching import Samples
 from leco_plugin.samplers.registry import SamplerSpec
 
@@ -122,6 +126,67 @@ class NearerByPreference(Jittered):
         return torch.rand(n_rays) ** 1.2
 
 
+class OfSomeRays(Sound):
+    """Rays that are no `usable` ones are taken to miss the box."""
+
+    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
+        ray_indices, t_starts, t_ends = super().sampling(rays_o, rays_d, *args, **options)
+        kept = self.usable(rays_o, rays_d)[ray_indices]
+        return ray_indices[kept], t_starts[kept], t_ends[kept]
+
+    def usable(self, origins: Tensor, directions: Tensor) -> Tensor:
+        raise NotImplementedError
+
+
+class FromOutsideOnly(OfSomeRays):
+    def usable(self, origins: Tensor, directions: Tensor) -> Tensor:
+        low, high = box().view(2, 3)
+        return ((origins < low) | (origins > high)).any(dim=-1)
+
+
+class NotAlongAxes(OfSomeRays):
+    """Divides by the directions."""
+
+    def usable(self, origins: Tensor, directions: Tensor) -> Tensor:
+        return (directions != 0.0).all(dim=-1)
+
+
+class SetsTheSeed(Sound):
+    """Draws the same numbers for each test image, and for each training step after one."""
+
+    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
+        if not options.get("stratified", False):
+            torch.manual_seed(0)
+        return super().sampling(rays_o, rays_d, *args, **options)
+
+
+class AtMostAThousand(Answers):
+    """Has room for so many samples of a ray."""
+
+    def change(self, ray_indices: Tensor, t_starts: Tensor, t_ends: Tensor) -> Samples:
+        places = torch.arange(len(ray_indices)) - torch.searchsorted(ray_indices, ray_indices)
+        kept = places < 1_024
+        return ray_indices[kept], t_starts[kept], t_ends[kept]
+
+
+class ShakenUnasked(Sound):
+    """Shifts rays in training, though a host wants them where they are."""
+
+    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
+        options["stratified"] = self.training
+        return super().sampling(rays_o, rays_d, *args, **options)
+
+
+class AsFirstAsked(Sound):
+    """Goes on deciding by what it held when it was first asked."""
+
+    def occupied(self, positions: Tensor) -> Tensor:
+        if "first" not in self.__dict__:
+            self.__dict__["first"] = copy.deepcopy(self.occupancy)
+        decided: Tensor = self.__dict__["first"].occupied(positions)
+        return decided
+
+
 MUTANTS: dict[str, tuple[type, ...]] = {
     "sorted-disjoint-inside": (
         ReversedOnce,
@@ -129,8 +194,11 @@ MUTANTS: dict[str, tuple[type, ...]] = {
         WithoutFarPlaneInTraining,
     ),
     "packing-consistent": (OffsetForgotten,),
+    "deterministic-in-eval": (SetsTheSeed,),
+    "all-kept-equals-dense": (AtMostAThousand, ShakenUnasked),
+    "state-dict-round-trip": (AsFirstAsked,),
     "stratified-in-training": (OneJitter, SharedByTwo, HalfAStep, NearerByPreference),
-    SKIPS: (PiecesOfTheFirst, ShortRunsDropped, FirstRunOnly),
+    SKIPS: (PiecesOfTheFirst, ShortRunsDropped, FirstRunOnly, FromOutsideOnly, NotAlongAxes),
 }
 """By the rule that must fail."""
 

@@ -8,6 +8,7 @@ import torch
 from conformance.estimator_mutants import rank
 from torch import Tensor
 
+from leco_plugin.conformance.scene import box
 from leco_plugin.hosts.proposal import LearnedOccupancySampler
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.registry import SamplerSpec
@@ -176,6 +177,16 @@ class InTheBoxOnly(SoundProposal):
         return super().worth(positions) * inside
 
 
+class FromOutsideOnlyProposal(SoundProposal):
+    """Takes rays that begin in the box to miss it."""
+
+    def worth(self, positions: Tensor) -> Tensor:
+        low, high = box().view(2, 3)
+        first = positions[..., :1, :]
+        inside = ((first > low) & (first < high)).all(dim=-1, keepdim=True)
+        return super().worth(positions).where(~inside, 1.0)
+
+
 class ForgetsTheFrame(SoundProposal):
     """Asks where the host is, whatever coordinates the occupancy was learned in."""
 
@@ -268,6 +279,7 @@ PROPOSAL_MUTANTS: dict[str, tuple[type, ...]] = {
         Uniform,
         FrontOnly,
         UniformInTraining,
+        FromOutsideOnlyProposal,
         ForgetsTheFrame,
         KnowsNoFrame,
         InTheBoxOnly,

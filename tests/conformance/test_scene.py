@@ -58,6 +58,14 @@ def test_rays_cross_the_slab_or_have_nothing_to_sample():
     assert (depths < 0.0).all()
 
 
+def test_rays_from_within_begin_in_the_box_and_leave_it_also_along_each_axis():
+    rays, (low, high) = scene.within(), scene.box().view(2, 3)
+    assert ((rays.origins > low) & (rays.origins < high)).all()
+    ends = rays.origins + rays.directions * rays.t_max[:, None]
+    assert ((ends < low) | (ends > high)).any(dim=1).all()
+    assert ((rays.directions == 0.0).sum(dim=1) == 2).sum() == 6
+
+
 def test_a_chord_ends_where_the_slab_does_to_a_hundredth():
     rays = cut_short()
     enters, leaves = chords(rays)
