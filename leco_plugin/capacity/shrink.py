@@ -214,11 +214,14 @@ def _check_original(original: Occupancy, file: Path, bounds: Bounds) -> None:
             f"--lost-surface-mass is from 0 to 1 and --image-price a number of dB, not "
             f"{bounds.lost_surface_mass} and {bounds.image_price_db}"
         )
-    for name in ("near", "far", "step_size"):
-        value = original.report.get(name)
-        if not (isinstance(value, int | float) and 0.0 <= value < math.inf):
+    marched = {"cone_angle": 0.0, **original.report}
+    for name in ("near", "far", "step_size", "cone_angle"):
+        value = marched.get(name)
+        known = isinstance(value, int | float) and 0.0 <= value < math.inf
+        if not known or (name == "step_size" and value == 0.0):
             raise ValueError(
-                f"{file} does not say how its rays are marched: its {name} is {value}, no distance"
+                f"{file} does not say how its rays are marched: its {name} is {value}; give the "
+                "file that a run has left"
             )
     skipped = original.report.get("empty_fraction")
     if original.threshold == 0.0:
@@ -247,7 +250,7 @@ def check_losses(source: Source, original: Occupancy, file: Path, bounds: Bounds
         ("image_price_db", "declares an image price of {:.3f} dB", bounds.image_price_db, ""),
     ):
         lost = declared(original, name)
-        if lost >= limit:
+        if not lost < limit:  # nor is NaN
             option = "--image-price" if name == "image_price_db" else "--lost-surface-mass"
             raise ValueError(
                 f"the occupancy itself {said.format(lost)}, which leaves nothing of {limit:g}: "

@@ -59,8 +59,11 @@ def teaches_the_host_alone(case: HostCase) -> None:
     groups = model.get_param_groups()
     handed_out = {id(parameter) for group in groups.values() for parameter in group}
     gradients = gradients_of_a_step(model)
-    reached = [name for name, gradient in gradients.items() if bool(gradient.any())]
+    named = dict(model.named_parameters())
+    reached = [named[name] for name, gradient in gradients.items() if bool(gradient.any())]
     require(bool(reached), "no parameter of the host gets a gradient")
+    learns = any(id(parameter) in handed_out for parameter in reached)
+    require(learns, "no optimizer is handed a parameter of the host that gets a gradient")
     for name, gradient in gradients.items():
         require(bool(gradient.isfinite().all()), f"the gradient of {name} is not finite")
     for name, parameter in model.leco_guide.named_parameters():

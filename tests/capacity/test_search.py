@@ -140,6 +140,8 @@ def test_nothing_is_lost_beyond_what_the_original_leaves() -> None:
         check_losses(NOBODY, original(lost_surface_mass=3e-3), FILE, Bounds(1e-3))
     with pytest.raises(ValueError, match="raise --image-price"):
         check_losses(NOBODY, original(image_price_db=0.06), FILE, Bounds())
+    with pytest.raises(ValueError, match="surface mass of nan, which leaves nothing"):
+        check_losses(NOBODY, original(lost_surface_mass=float("nan")), FILE, Bounds())
     check_losses(NOBODY, original(lost_surface_mass=4e-4, image_price_db=-0.1), FILE, Bounds())
 
 

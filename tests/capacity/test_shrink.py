@@ -174,6 +174,8 @@ def test_bad_input_ends_with_one_line_and_status_2(
         "raise --lost-surface-mass": [ball, *data, *out, "--lost-surface-mass", 0],
         "how its rays are marched": [tmp_path / "silent", *data, *out],
         "not nan": [ball, *data, *out, "--lost-surface-mass", "nan"],
+        "step_size is 0.0": [changed("standing", step_size=0.0), *data, *out],
+        "cone_angle is wide": [changed("wide", cone_angle="wide"), *data, *out],
         "step_size is small": [changed("aground", step_size="small"), *data, *out],
         "its threshold is 0": [changed("idle", threshold=0.0), *data, *out],
         "skips 4.0% of all candidates": [changed("foggy", empty_fraction=0.04), *data, *out],

@@ -117,6 +117,13 @@ class LearnsNothing(NGPModel):
         return {name: 0.0 * loss for name, loss in super().get_loss_dict(*args, **options).items()}
 
 
+class HandsOutNothing(NGPModel):
+    """Has its field in no optimizer."""
+
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        return {}
+
+
 class Thaws(NerfactoModel):
     """Has everything trained that it holds."""
 
@@ -250,6 +257,7 @@ HOST_MUTANTS: dict[str, dict[str, GuidedModelConfig]] = {
     "samples-shift-in-training": {"NeverShakenHost": packed(NeverShaken)},
     "teaches-the-host-alone": {
         "LearnsNothing": packed(LearnsNothing),
+        "HandsOutNothing": packed(HandsOutNothing),
         "Thaws": proposal(Thaws),
     },
     "nothing-superfluous-is-left": {
