@@ -16,6 +16,7 @@ from torch import Tensor
 
 from leco_plugin.capacity.sources import Seen
 from leco_plugin.evaluation.field_grids import in_parts
+from leco_plugin.learning.calibration import EXACT, price_db
 from leco_plugin.learning.dense import in_chunks, near_surface, weighed
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.rendering import Intervals, Rays, backdrop_of
@@ -183,5 +184,4 @@ def image_price(mixture: Mixture, rendered: Sequence[Rendered], smaller: Occupan
         before += float((one.rgb - one.truth).square().sum(dtype=torch.float64))
         after += float((rgb - one.truth).square().sum(dtype=torch.float64))
         pixels += one.truth.numel()
-    floor = 1e-10 * max(pixels, 1)
-    return 10.0 * math.log10((after + floor) / (before + floor))
+    return price_db(after, before, EXACT * max(pixels, 1))

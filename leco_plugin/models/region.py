@@ -68,7 +68,6 @@ class Region(nn.Module):
 
     def refuse_others(self, bounds: BoundsConfig, near: float | None, far: float | None) -> None:
         """InputError if near, far or bounds that are set by hand are not those of the region."""
-        kind = "contraction" if bool(self.space.unbounded) else "box"
         asked: dict[str, tuple[Any, Tensor]] = {"near": (near, self.near), "far": (far, self.far)}
         if bounds.space != "contraction":  # else they say nothing
             asked["bounds.altitudes"] = (bounds.altitudes, self.aabb[2::3])
@@ -77,8 +76,8 @@ class Region(nn.Module):
             for option, (now, there) in asked.items()
             if now is not None and not torch.allclose(torch.tensor(now).to(there), there, rtol=1e-5)
         }
-        if bounds.space not in ("auto", kind):
-            other["bounds.space"] = bounds.space, kind
+        if bounds.space not in ("auto", self.space.kind):
+            other["bounds.space"] = bounds.space, self.space.kind
         for option, (now, before) in other.items():
             raise InputError(
                 f"--pipeline.model.{option} is {now}, and the run that is gone on with has "
