@@ -79,7 +79,9 @@ def newest_whole(checkpoints: Path) -> tuple[Path, list[str]]:
                 return path, damaged
             damaged.append(f"{path} is damaged ({damage})")
     if not damaged:
-        raise InputError(f"there is no checkpoint in {checkpoints}")
+        inside = sorted({path.parent for path in checkpoints.glob("*/step-*.ckpt")})
+        remedy = f"give {inside[0]}" if inside else "give a run's folder of checkpoints"
+        raise InputError(f"there is no checkpoint in {checkpoints}: {remedy}")
     raise InputError(
         f"no checkpoint can be gone on with: {'; '.join(damaged)}; put a copy of one of them back, "
         "or train again"

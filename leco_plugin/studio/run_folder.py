@@ -29,7 +29,12 @@ from leco_plugin.models.sizing.sizes import sizes_in, sizes_to_resume
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.locks import lock, unlock, writing_into
 from leco_plugin.scenes.whole_files import write_whole
-from leco_plugin.studio.checkpoints import allow_checkpoint_globals, newest_whole, step_of
+from leco_plugin.studio.checkpoints import (
+    allow_checkpoint_globals,
+    damage_of,
+    newest_whole,
+    step_of,
+)
 
 OUTPUT = "--output-dir"
 """The option that says where runs' folders are made."""
@@ -78,13 +83,19 @@ CONFIG = "config.yml"
 
 def checkpoint_of(config: Any) -> Path | None:
     """The checkpoint that training goes on from: of a folder, the newest that is whole. InputError
-    if the folder holds none."""
-    if config.load_dir is None:
-        path: Path | None = config.load_checkpoint
-        return path
-    if config.load_step is not None:
-        return Path(config.load_dir) / f"step-{config.load_step:09d}.ckpt"
-    return newest_whole(config.load_dir)[0]
+    if the folder holds none, or the one that is named is not there or damaged."""
+    path: Path | None = config.load_checkpoint
+    if config.load_dir is not None:
+        if config.load_step is None:
+            return newest_whole(config.load_dir)[0]
+        path = Path(config.load_dir) / f"step-{config.load_step:09d}.ckpt"
+    if path is None:
+        return None
+    fault = damage_of(path) if path.exists() else "there is no such file"
+    if fault is not None:
+        remedy = "give --load-dir without --load-step for the newest that is whole"
+        raise InputError(f"the checkpoint {path} cannot be gone on with ({fault}): {remedy}")
+    return path
 
 
 def with_sizes_of(config: Any, checkpoint: Path | None) -> Any:

@@ -188,9 +188,16 @@ def test_no_image_is_decoded_to_choose_sizes(
 def test_the_checkpoint_to_go_on_from(tmp_path: Path) -> None:
     config = config_of(tmp_path, tmp_path, "x")
     assert checkpoint_of(config) is None
-    path = tmp_path / "some.ckpt"
-    assert checkpoint_of(replace(config, load_checkpoint=path)) == path
-    found = checkpoint_of(replace(config, load_dir=tmp_path, load_step=7))
-    assert found == tmp_path / "step-000000007.ckpt"
-    with pytest.raises(InputError, match="there is no checkpoint"):
+    models = tmp_path / "models"
+    models.mkdir()
+    path = models / "step-000000007.ckpt"
+    torch.save({}, path)
+    for given in ({"load_checkpoint": path}, {"load_dir": models, "load_step": 7}):
+        assert checkpoint_of(replace(config, **given)) == path
+    with pytest.raises(InputError, match=f"there is no checkpoint in {tmp_path}: give {models}$"):
         checkpoint_of(replace(config, load_dir=tmp_path))
+    with pytest.raises(InputError, match=r"8\.ckpt cannot .*no such file.*without --load-step"):
+        checkpoint_of(replace(config, load_dir=models, load_step=8))
+    path.write_bytes(path.read_bytes()[:-30])
+    with pytest.raises(InputError, match=r"7\.ckpt cannot be gone on with \(File is not a zip"):
+        checkpoint_of(replace(config, load_checkpoint=path))
