@@ -8,7 +8,7 @@ import checkout  # noqa: F401
 from chart_sections import notes, stored
 from page_parts import ROOT, between, table
 
-from leco_plugin.chart.summary import MEMORY, RENDERING, Line, lines_of
+from leco_plugin.chart.summary import MEMORY, RENDERING, Line, lines_of, sentence
 
 PAGE = ROOT / "docs" / "upstream" / "leco_nerf.md"
 MARKS = "<!-- results: generated -->", "<!-- end of the results -->"
@@ -23,22 +23,30 @@ HEAD = "Method | Trained for | Sampling | Memory | PSNR | Rendering an image"
 BELOW = r"""
 75 drone photographs of a building site (OpenDroneMap's `odm_data_caliterra`, 480 x 360), on one CPU
 core each. Memory is the most that the process held, a median. PSNR is of test photographs: the mean
-of {seeds} seeds, with the least and the most. Below each method stands what it is compared with."""
+of {seeds} seeds, with the least and the most. Below each method stands the same one without a
+learned occupancy.{better}"""
 OLD = r" A method marked (\*) has a chart that was made before a later change."
 
 
 def page(text: str) -> str:
     """The page with its table renewed."""
-    rows, seeds = [], set()
+    rows, seeds, better = [], set(), []
     for method, name in CHARTS.items():
         lines = [line for line in lines_of(stored(name)) if line.method == method]
         guided = next(line for line in lines if line.learned)
-        other = next(line for line in lines if not line.learned)
+        other, *others = (line for line in lines if not line.learned)
+        better += [
+            f" {sentence(line.name)} takes `{method}` to {line.psnr:.1f} dB."
+            for line in others
+            if line.psnr > other.psnr and line.psnr == max(each.psnr for each in others)
+        ]
         mark = r" (\*)" if name in notes() else ""
         rows += [[f"`{method}`{mark}", *_cells(guided)], ["", *_cells(other)]]
         seeds |= {len(guided.runs), len(other.runs)}
     count = " or ".join(str(some) for some in sorted(seeds))
-    below = BELOW.format(seeds=count) + OLD * any(name in notes() for name in CHARTS.values())
+    below = BELOW.format(seeds=count, better="".join(better)) + OLD * any(
+        name in notes() for name in CHARTS.values()
+    )
     return between(text, MARKS, "\n".join([*table(HEAD, rows), below]))
 
 

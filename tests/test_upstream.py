@@ -9,10 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import upstream_page
+from chart_sections import stored
 from nerfstudio.configs import external_methods
 from nerfstudio.configs.method_configs import merge_methods
 from nerfstudio.plugins.types import MethodSpecification
 from rich.text import Text
+
+from leco_plugin.chart.summary import lines_of
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "upstream"
 PAGE = FOLDER / "leco_nerf.md"
@@ -54,6 +58,15 @@ def test_nerfstudio_offers_what_is_not_installed_and_keeps_what_is(entry: Any) -
     own = {"leco-ngp": registered()["leco-ngp"].config}
     methods, _ = merge_methods(own, {"leco-ngp": "ours"}, offered, said, overwrite=False)
     assert methods["leco-ngp"] is own["leco-ngp"] and methods.keys() == offered.keys()
+
+
+def test_another_row_that_ends_better_than_the_one_shown_is_named() -> None:
+    said = " ".join(upstream_page.page(PAGE.read_text()).split())
+    for method, name in upstream_page.CHARTS.items():
+        lines = [line for line in lines_of(stored(name)) if line.method == method]
+        others = [line for line in lines if not line.learned]
+        best = max(others, key=lambda line: line.psnr)
+        assert (f"takes `{method}` to {best.psnr:.1f} dB." in said) == (best is not others[0])
 
 
 def test_the_page_describes_every_method_once_and_no_other() -> None:
