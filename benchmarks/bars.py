@@ -13,7 +13,7 @@ import checkout  # noqa: F401
 from page_parts import noted
 from stability_page import has_lost, runs_gone_on
 
-from leco_plugin.chart.learned import learned_of
+from leco_plugin.chart.learned import Learned
 from leco_plugin.chart.methods import NEVER_FROZEN, VARIANTS
 from leco_plugin.chart.summary import Line, Verdict, figure_in, lines_of, versus
 from leco_plugin.chart.table import rows
@@ -97,7 +97,7 @@ def of_occupancy(key: str, scale: float = 1.0) -> Callable[[Results], Values]:
     """Reads a figure of the learned occupancy of a chart, of the gate with which each run ends."""
 
     def read(results: Results) -> Values:
-        (learned,) = learned_of(lines_of(results))
+        (learned,) = (Learned(**vars(line)) for line in lines_of(results) if line.learned)
         found = [figure_in(facts["at_end"], key) for facts in learned.facts]
         never = [None] * (learned.seeds - len(found) + failed_runs(results, learned))
         return [None if value is None else scale * value for value in found] + never

@@ -157,6 +157,17 @@ def test_kills_reach_their_bar_where_nothing_is_lost_and_all_end_alike(
     assert row(tmp_path, "Killed at any step") == [measured, reached, "`kills`"]
 
 
+def test_a_chart_none_of_whose_gates_was_frozen_misses_the_bars_of_occupancies(
+    tmp_path: Path,
+) -> None:
+    made = chart([0.999, 0.998])
+    for one in made["runs"]:
+        one["freeze_seconds"] = None
+    store(tmp_path, "charts/city-3", made)
+    found = row(tmp_path, "City: visible surface kept")
+    assert found[:2] == ["never with 2 of 2 seeds", "**no**"]
+
+
 def test_a_card_reaches_its_bar_when_a_run_on_it_came_to_its_end(tmp_path: Path) -> None:
     store(tmp_path, "gpu-a", {"parts": {"learned": {}}})
     assert row(tmp_path, "On CUDA") == ["no run came to its end", "**no**", "`gpu-a`"]
