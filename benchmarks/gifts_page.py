@@ -51,7 +51,8 @@ learned-occupancy-without-gifts` charts a learned row without them; a stored one
 - **Warm-up**: a grid asks all of its cells at first, for at most 1/{1 / WARM_UP:.0f} of a run.
 - **Rates** and **batch**: learning rates of the host, and what it shades in a step on a CPU.
 - **Table**: entries of a level of the field's hash table, on a CPU.
-- **Codes**: small ones begin at zero. Those of nerfstudio cost test views several dB.
+- **Codes**: small ones begin at zero. Those of nerfstudio cost test views
+  [several dB](hosts.md#appearance-codes) of a drone survey.
 - **Front to back**: images leave out what lies behind opaque surfaces. *guided*: where that is
   faster.
 - **Clock**: all that the process of a run does counts, drawing rays too. Data managers of
@@ -62,8 +63,9 @@ learned-occupancy-without-gifts` charts a learned row without them; a stored one
   and bounds are each method's own; LeCO also renders in C, and has the largest table. What a gate
   gains is seen between rows of one method.
 
-All have nerfstudio's rates, and sizes that a step on a CPU can pay. [Swept](#the-rivals-swept) are
-those of the rivals, ours are not.
+Instant-NGP and Nerfacto begin with nerfstudio's rates, the others with rates of ours. All rates
+fall to a tenth. Sizes are what a step on a CPU can pay. Rates and sizes of rivals were
+[swept](#the-rivals-swept), those of learned rows were not.
 
 This page is generated: `python benchmarks/reference_pages.py`.
 """

@@ -120,8 +120,8 @@ def main(options: Options) -> None:
 
 
 def sweep_lines(results: dict[str, Any]) -> list[str]:
-    """What is said of the stored sweep, its table, and what made it. Rows that were not run are
-    left out."""
+    """What is said of the stored sweep, its table, which runs failed, and what made it. Rows
+    without a result are left out of the table."""
     psnrs: dict[str, list[float]] = {}
     for run in results["runs"]:
         psnrs.setdefault(run["name"], []).append(run["psnr"])
@@ -142,7 +142,9 @@ def sweep_lines(results: dict[str, Any]) -> list[str]:
     )
     about = f"`{made['command']}`, {made['date']}, leco_plugin {made['version']}; "
     head = "row | mean PSNR | beside the row of charts"
-    return [said, "", *table(head, rows), "", f"{about}{machine_line(results)}."]
+    failed = [f"{one['name']}, seed {one['seed']}" for one in results["failures"]]
+    failures = [f"Failed: {'; '.join(failed)}.", ""] if failed else []
+    return [said, "", *table(head, rows), "", *failures, f"{about}{machine_line(results)}."]
 
 
 if __name__ == "__main__":

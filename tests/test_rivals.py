@@ -60,10 +60,12 @@ def test_a_better_row_is_ahead_and_a_row_that_was_not_run_is_left_out() -> None:
     made = {"command": "benchmarks/rivals.py city", "date": "2026-11-29", "version": "0.1.0"}
 
     about = {"scene": {"name": "city"}, "protocol": {"seconds": 120.0}, "machine": {"cores": 2}}
-    lines = rivals.sweep_lines({"runs": runs, "made": made, **about})
+    failures = [{"name": others[2].name, "seed": 1, "reason": "no memory"}]
+    lines = rivals.sweep_lines({"runs": runs, "made": made, "failures": failures, **about})
 
     rows = [line for line in lines if line.startswith("| ")][1:]
     assert len(rows) == 3
     assert "20.1 dB" in rows[0]
     assert "22.1 dB" in rows[1] and "ahead: +2.00" in rows[1]
     assert "17.1 dB" in rows[2] and "behind: -3.00" in rows[2]
+    assert f"Failed: {others[2].name}, seed 1." in lines
