@@ -100,12 +100,18 @@ def finding(grown: Sequence[Grown]) -> str:
     first, last = grown[0], grown[-1]
     kept = f"{span([100 * one.gate['kept_volume'] for one in grown])}% of the volume"
     times = f"{span([one.times for one in grown])} times as much"
-    octrees = [stored_bytes(one.grid) / 1000 for one in grown]
+    gates, octrees = (
+        [stored_bytes(row) / 1000 for row in rows]
+        for rows in zip(*((one.gate, one.grid) for one in grown))
+    )
+    sizes = {"the gate": gates, "the grid": octrees}
+    rising = [name for name, its in sizes.items() if its == sorted({*its})]
+    grows = f"The bytes of {' and '.join(rising)} grow with the area."
     return (
         f"From {first.blocks} to {last.blocks} blocks a side the gate takes "
-        f"{span([one.gate['bytes'] / 1000 for one in grown])} kB and keeps {kept}. A grid with "
+        f"{span(gates)} kB and keeps {kept}. A grid with "
         f"the same lesson, chosen by the same rule, takes {span(octrees)} kB as an octree and "
-        f"keeps {times}. Neither follows the area."
+        f"keeps {times}. {grows if rising else 'Neither follows the area.'}"
     )
 
 

@@ -9,8 +9,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import checkout  # noqa: F401
+from page_parts import table
 
 from leco_plugin.chart.summary import Verdict, compare
+from leco_plugin.log import counted
 
 Report = dict[str, Any]
 Run = dict[str, Any]
@@ -20,18 +22,20 @@ MAY_LOSE = 0.1
 
 def bounds_table(report: Report) -> str:
     """A row for each way to set near and far, and the verdict."""
-    lines = ["| near and far | rays cut at planes | PSNR, mean (each seed) |", "|---|---|---|"]
-    groups: dict[tuple[str, bool], list[Any]] = {}
+    groups: dict[tuple[str, bool], list[float | None]] = {}
     for run in report["runs"]:
         name = "automatic" if run["range"] is None else "{:g} to {:g}".format(*run["range"])
         groups.setdefault((name, run["planes"]), []).append(run["psnr"])
+    cells = []
     for (name, planes), values in groups.items():
-        figures = "failed"
-        if None not in values:
-            each = ", ".join(f"{value:.2f}" for value in values)
-            figures = f"{statistics.fmean(values):.2f} dB ({each})"
-        lines.append(f"| {name} | {'yes' if planes else 'no'} | {figures} |")
-    return "\n".join([*lines, "", *bounds_verdict(report["runs"])])
+        known = [value for value in values if value is not None]
+        figures = f"failed with {len(values) - len(known)} of {counted(len(values), 'seed')}"
+        if len(known) == len(values):
+            each = ", ".join(f"{value:.2f}" for value in known)
+            figures = f"{statistics.fmean(known):.2f} dB ({each})"
+        cells.append((name, "yes" if planes else "no", figures))
+    head = "near and far | rays cut at planes | PSNR, mean (each seed)"
+    return "\n".join([*table(head, cells), "", *bounds_verdict(report["runs"])])
 
 
 def bounds_verdict(runs: Sequence[Run]) -> list[str]:
@@ -40,20 +44,17 @@ def bounds_verdict(runs: Sequence[Run]) -> list[str]:
 
     The best of several means is above its own expectation, which favours the pair.
     """
-    lines = [
-        f"| by hand | best | automatic | reached: at most {MAY_LOSE:g} dB below "
-        "| automatic against the best pair |",
-        "|---|---|---|---|---|",
-    ]
+    cells = []
     automatic = [*_by_seed(run for run in runs if run["range"] is None)["null"].values()]
     for name, by_hand in ((name, _by_seed(some)) for name, some in ways_of(runs).items()):
         if by_hand:
             pairs = ([*values.values()] for values in by_hand.values())
             best = max(pairs, key=statistics.fmean)
             found = compare(automatic, best)
-            means = " | ".join(f"{statistics.fmean(psnrs):.2f} dB" for psnrs in (best, automatic))
-            lines.append(f"| {name} | {means} | {reached(found)} | {found.said()} |")
-    return lines
+            means = [f"{statistics.fmean(psnrs):.2f} dB" for psnrs in (best, automatic)]
+            cells.append([name, *means, reached(found), found.said()])
+    head = f"by hand | best | automatic | reached: at most {MAY_LOSE:g} dB below "
+    return table(f"{head}| automatic against the best pair", cells)
 
 
 def reached(found: Verdict) -> str:
@@ -87,17 +88,17 @@ def _by_seed(runs: Iterable[Run]) -> dict[str, dict[int, float]]:
 
 def memory_table(report: Report) -> str:
     """What photographs take in memory, for each way to hold them."""
-    lines = [
-        "| way | peak beyond what is imported, MB | with a tenth of width and height, MB "
-        "| photographs decoded as bytes, MB | as floats, MB |",
-        "|---|---|---|---|---|",
-    ]
     names = ("added_bytes", "added_on_a_tenth_bytes", "decoded_bytes", "decoded_float_bytes")
+    cells = []
     for run in report["runs"]:
-        cells = " | ".join(f"{run[name] / 1e6:,.0f}" for name in names if name in run)
-        over = "**over the allowance** | | |"
-        lines.append(f"| {run['way']} | {cells if run['within_allowance'] else over} |")
-    return "\n".join(lines)
+        known = [f"{run[name] / 1e6:,.0f}" if name in run else "-" for name in names]
+        over = ["**over the allowance**", "-", "-", "-"]
+        cells.append([run["way"], *(known if run["within_allowance"] else over)])
+    head = (
+        "way | peak beyond what is imported, MB | with a tenth of width and height, MB "
+        "| photographs decoded as bytes, MB | as floats, MB"
+    )
+    return "\n".join(table(head, cells))
 
 
 def _bounds_note(report: Report) -> str:

@@ -78,10 +78,12 @@ def headline(report: dict[str, Any]) -> str:
 
 
 def sentence(report: dict[str, Any]) -> str:
-    """What the picture shows."""
+    """What the picture shows, with two digits."""
     _, empty, scene = late_means(report)
-    times = float(f"{scene / empty:.1g}")
-    return f"{headline(report)}, about {times:,.0f} times less dense than the rest"
+    if not empty:
+        return f"{headline(report)}, which have no density"
+    times = float(f"{scene / empty:.2g}")
+    return f"{headline(report)}; they are about {times:,.4g} times less dense than the rest"
 
 
 def draw(path: Path, report: dict[str, Any], theme: Theme = LIGHT) -> Path:

@@ -1,4 +1,4 @@
-"""The part of `docs/results.md` that says where the time of a step goes."""
+"""The part of `docs/measurements.md` that says where the time of a step goes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ PARTS = (
     *("data", "candidates", "sampling", "gate", "encoding", "experts", "field", "colour"),
     *("weights", "front to back", "loss", "optimizer", "rest"),
 )
-"""In the order of a step."""
+"""In the order of a step; others stand behind them."""
 BUSY = 0.5
 """Mean processes that ran when it began, from which on figures are not to be trusted."""
 VIEW = 480 * 360
@@ -70,9 +70,8 @@ def _table(row: dict[str, Any]) -> list[str]:
 
 def _rows(row: dict[str, Any], phases: list[str]) -> Iterator[list[str]]:
     scales = {phase: 1.0 for phase in phases} | {"rendering": VIEW / row["rendering"]["rays"]}
-    for part in PARTS:
-        if not any(part in row[phase]["parts"] for phase in phases):
-            continue
+    there = [part for phase in phases for part in row[phase]["parts"]]
+    for part in dict.fromkeys([*(part for part in PARTS if part in there), *there]):
         cells = [part]
         for phase in phases:
             each = row[phase]["parts"].get(part)

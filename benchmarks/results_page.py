@@ -146,11 +146,11 @@ experts, no gate* has as many scene experts, none for empty space, as Switch-NeR
   measured. Figures of quality that no run of a chart has are named below its table.
 - A *candidate* is a place on a ray at which a model that skips nothing would ask its network.
   **Candidates skipped**, **price** and **lost surface mass** are of held-out pixels at the moment
-  of freezing (in charts of before 24 November 2026 at the end, which differs where a threshold was
-  lowered), over the seeds in which a gate was frozen. **At the end** they are of the gate that the
-  run leaves, often a smaller one; so are **parameters** and **kB**. **Healed** counts recoveries
-  from collapse. **Volume kept at 1e-3** is of what rays reach of the scene, with the threshold that
-  loses one thousandth of the surface: so gates and grids are compared at the same price.
+  of freezing, over the seeds in which a gate was frozen. **At the end** they are of the gate that
+  the run leaves, often a smaller one; so are **parameters** and **kB**. **Healed** counts
+  recoveries from collapse. **Volume kept at 1e-3** is of what rays reach of the scene, with the
+  threshold that loses one thousandth of the surface: so gates and grids are compared at the same
+  price.
 - **True surface kept** and **free space skipped** compare with the exact city.
 
 How much sooner one method is than another depends on the machine: learning takes a number of steps,
@@ -348,9 +348,9 @@ def learning_section(report: dict[str, Any]) -> list[str]:
     return [
         "## While an occupancy is learned\n",
         f"{picture(LEARNING.stem)}\n",
-        f"{learning_sentence(report)}, in the later half of learning. Points are spread over the "
-        "scene's box; a mean density is of those that an expert gets, per half extent. Which scene "
-        "expert takes what changes to the end; what is empty does not.\n",
+        f"{learning_sentence(report)}. Both are of the later half of learning. Points are spread "
+        "over the scene's box; a mean density is of those that an expert gets, per half extent. "
+        "Which scene expert takes what changes to the end; what is empty does not.\n",
         "![Slices of the occupancy from above and from the side, step by step]"
         "(images/learning.gif)\n",
         f"`ns-train leco-occupancy --data {report['scene']} {recorded}` and `python "

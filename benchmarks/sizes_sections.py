@@ -1,4 +1,4 @@
-"""What docs/results.md says of how much a scene needs, from what is stored."""
+"""What docs/measurements.md says of how much a scene needs, from what is stored."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 from chart_sections import notes
 from page_parts import RESULTS, made_line, picture, section
-from sizes_figures import AS_GOOD
+from sizes_figures import AS_GOOD, MAY_HAVE, MAY_LOSE
 from sizes_tables import capacity_table, samples_table, shrink_table, sizes_table
 
 CAPACITY = "capacity-"
@@ -24,7 +24,8 @@ def sizes_sections() -> list[str]:
         steps, learn = report["settings"]["steps"], report["settings"]["learn_steps"]
         note = (
             f" {steps} steps each, {learn} of them learning; PSNR of test pixels. Best is the "
-            f"smallest that lies within {AS_GOOD:g} dB of the highest mean. Runs "
+            f"smallest that lies within {AS_GOOD:g} dB of the highest mean. Within bounds: at most "
+            f"{MAY_LOSE:g} dB behind it, with at most {MAY_HAVE:g} times its parameters. Runs "
             f"{made_line(report['runs'])}."
         )
         named = [scene["scene"] for scene in report["scenes"] if "blocks" not in scene]
@@ -37,8 +38,8 @@ def sizes_sections() -> list[str]:
             " Lowered: an original that itself loses too much is shrunk at a threshold at which it "
             "does not, and keeps so much more of the volume there. In bold: a bar is missed, 32 "
             "kB, a declared loss of 1e-3, three times faster queries (65536 positions, "
-            "interleaved), or a declaration below what rays of test photographs have lost, which "
-            "decided nothing. "
+            "interleaved); or rays of test photographs, which decided nothing, lost more than "
+            "those that verified the gate, and the file declares that. "
             f"Gates {made_line(shrunk.values())}."
         )
         command = (

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from page_parts import span, table
-from sizes_figures import MAY_LOSE, bars, verdict
+from sizes_figures import MAY_HAVE, MAY_LOSE, bars, verdict
 
 from leco_plugin.capacity.choice import best_gate, choose, kilobytes, stored_bytes
 
@@ -57,7 +57,7 @@ def sizes_table(report: Report) -> str:
             f"| {scene} | {found['seeds']} | {found['psnr']:.2f} dB, {found['parameters']:,} "
             f"| {found['best']}: {found['best_psnr']:.2f} dB, {found['best_parameters']:,} "
             f"| {_with_margin(found['behind'], found['margin'])} dB "
-            f"| {_told_apart(found, found['behind'] - MAY_LOSE)} |"
+            f"| {_within_bounds(found)} |"
         )
     measured = bars(report["scenes"], report["runs"])
     if measured:
@@ -200,6 +200,14 @@ def _with_margin(value: float, margin: float | None) -> str:
 
 def _yes(reached: bool) -> str:
     return "yes" if reached else "**no**"
+
+
+def _within_bounds(found: Report) -> str:
+    """Whether automatic sizes are near the best of a sweep in PSNR and in parameters; of these no
+    interval leaves open whether they are too many."""
+    if found["parameters"] > MAY_HAVE * found["best_parameters"]:
+        return f"{_yes(False)}, too many parameters"
+    return _told_apart(found, found["behind"] - MAY_LOSE)
 
 
 def _told_apart(found: Report, beyond: float) -> str:

@@ -55,6 +55,10 @@ def test_the_growth_table_has_bytes_of_bits_and_of_octrees() -> None:
         "the same lesson, chosen by the same rule, takes 9.0 kB as an octree and keeps 1.5 to 3.0 "
         "times as much. Neither follows the area."
     )
+    larger = report(0.06)
+    larger["representations"][0]["bytes"] = 5000
+    said = growth_table({**REPORTS, "city-8": larger}).splitlines()[-1]
+    assert said.endswith("times as much. The bytes of the gate grow with the area.")
 
 
 def test_growth_is_drawn_with_what_it_was_drawn_from(tmp_path: Path) -> None:
@@ -77,7 +81,7 @@ def test_memory_is_told_in_megabytes() -> None:
     lines = memory_table({"runs": [run, over]}).splitlines()
     assert lines[-2:] == [
         "| disk | 562 | 501 | 531 | 2,124 |",
-        "| memory | **over the allowance** | | | |",
+        "| memory | **over the allowance** | - | - | - |",
     ]
 
 
@@ -150,7 +154,7 @@ def test_a_pair_with_which_a_run_failed_is_not_the_best() -> None:
     lost = next(row for row in rows if row["range"] == [0.1, 2.0])
     lost |= {"psnr": None, "failed": "step 75: the gate calls all space empty"}
     assert verdicts(rows)[ALONE][0] == "20.00 dB"
-    assert "| 0.1 to 2 | no | failed |" in bounds_table({"runs": rows})
+    assert "| 0.1 to 2 | no | failed with 1 of 2 seeds |" in bounds_table({"runs": rows})
 
 
 def test_one_seed_decides_nothing_and_the_first_run_has_nothing_beside_it() -> None:

@@ -30,8 +30,11 @@ def test_the_sentence_is_of_the_later_looks_and_opaque_is_opaque() -> None:
     assert share == pytest.approx(0.625) and empty == pytest.approx(3.0)
     assert scene == pytest.approx((200.0 + learning.OPAQUE) / 2)
     assert learning.sentence(report) == (
-        "The empty-space expert takes 62% of the points, about 2,000 times less dense than the rest"
+        "The empty-space expert takes 62% of the points; they are about 1,700 times less dense "
+        "than the rest"
     )
+    empty = {**report, "densities": [[0.0, *rest] for _, *rest in report["densities"]]}
+    assert learning.sentence(empty).endswith("takes 62% of the points, which have no density")
 
 
 def test_an_expert_without_points_has_no_density() -> None:

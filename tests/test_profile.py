@@ -103,6 +103,9 @@ def test_the_page_says_what_takes_most() -> None:
     assert "Field and rest take 100% of a guided step, the backward pass 60%" in text
     assert "| field | 3.00 + 6.00 | 0.50 + 1.00 |" in text and "| learning" not in text
     assert "Other processes ran meanwhile (load 2.0)" in text
+    phase["parts"]["of a later code"] = small
+    text = "\n".join(profile_sections({"machine": {}, "scenes": {"city": {"leco-ngp": row}}}))
+    assert "| of a later code | 1.00 | - |" in text
 
 
 def test_the_standard_library_keeps_its_profile() -> None:

@@ -142,6 +142,13 @@ def test_the_table_has_a_row_for_each_scene_point_and_bar() -> None:
     *_, few, _, eight = sizes_table(report).splitlines()
     assert few == "| parameters of city-1 against city-8 | 1.00 | 0.25 | **no** |"
     assert eight.endswith(" | 0.05 ± 3.35 | 0.1 | yes, within the interval |")
+    cheap = MEASURED | {"table x 0.25": [20.0, 20.4]}  # 200 parameters beside 90, whoever is ahead
+    (row,) = (
+        line
+        for line in sizes_table({"scenes": [scene], "runs": runs("city-1", cheap)}).splitlines()
+        if "| table x 0.25: " in line
+    )
+    assert row.endswith("| 0.10 ± 1.38 dB | **no**, too many parameters |")
     alone = [run for run in scattered if run["seed"] == 0]
     assert sizes_table({**report, "runs": alone}).splitlines()[-1].endswith("one seed |")
 
