@@ -42,6 +42,7 @@ PROGRESS, SHOWN_AT = re.compile(r"Training: (\d+)%"), 25
 """Of lines on the training the one nearest to this share is shown."""
 QUOTED = ("are placed", "in metres by", "a gate of", "finished:")
 """What README shows of it."""
+VOUCHED = re.compile(r"(\d+) photographs that taught it nothing")
 
 
 def walk(photos: Path, folder: Path) -> None:
@@ -107,6 +108,8 @@ def quote(report: dict[str, Any]) -> str:
     chosen = [line for line in lines if any(some in line for some in QUOTED)]
     costs, others = report["costs"], report["other_runs"]
     minutes = sum(report["seconds"][name] for name in ("poses", "train", "film")) / 60.0
+    vouched = [found[1] for line in lines if (found := VOUCHED.match(line))]
+    photographs = " ".join([*vouched[-1:], "photographs"])
     worst = [one["worst_surface_mass"] for one in (costs, *others)]
     return "\n".join(
         [
@@ -114,8 +117,8 @@ def quote(report: dict[str, Any]) -> str:
             "",
             f"All three took {minutes:.0f} minutes on two CPU cores. A learned gate skipped first, "
             "then its smaller successor. Together they hide "
-            f"{costs['lost_surface_mass']:.2%} of the surfaces that held-out pixels show; of nine "
-            f"photographs that taught them nothing, the worst lost {worst[0]:.1%}"
+            f"{costs['lost_surface_mass']:.2%} of the surfaces that held-out pixels show; of "
+            f"{photographs} that taught them nothing, the worst lost {worst[0]:.1%}"
             + "".join(f" ({other:.1%} in another run)" for other in worst[1:])
             + ".",
         ]
