@@ -1,4 +1,4 @@
-"""What all sections of docs/results.md are made of."""
+"""What the sections of generated pages are made of."""
 
 from __future__ import annotations
 

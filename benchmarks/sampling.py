@@ -1,7 +1,7 @@
 """What asking the learned occupancy costs: `python benchmarks/sampling.py`.
 
 Every figure is a ratio of two things that run in turn in one process. Results go to
-`benchmarks/results/sampling.json`, from which the table of docs/results.md is made.
+`benchmarks/results/sampling.json`, from which the table of docs/measurements.md is made.
 """
 
 from __future__ import annotations

@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import checkout  # noqa: F401
-from page_parts import between
+from page_parts import ROOT, between, table
 
 from leco_plugin.stability.cases import CASES
 from leco_plugin.stability.table import failures, headline, verdicts
 
-ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs" / "stability.md"
 PICTURE = ROOT / "docs" / "images" / "stability.png"
 TABLE = "<!-- results: generated -->", "<!-- end of the results -->"
@@ -33,8 +32,8 @@ def page(text: str, results: Path) -> str:
 
 def of_cases() -> str:
     """All cases, with the reason for each."""
-    rows = [f"| `{case.name}` | {case.title} | {case.why} |" for case in CASES.values()]
-    return "\n".join(["| name | case | why it is there |", "|---|---|---|", *rows])
+    cells = [(f"`{case.name}`", case.title, case.why) for case in CASES.values()]
+    return "\n".join(table("name | case | why it is there", cells))
 
 
 def of_table(results: dict[str, Any]) -> str:
