@@ -86,7 +86,8 @@ def stability(
 
     Writes stability.json, table.md, stability.png, stability-dark.png, and for each failure a
     picture in failures. What is finished is kept whenever this is stopped; the same command goes on
-    with what is missing. Exits with 1 if the case that must fail passes: then no verdict counts.
+    with what is missing. Exits with 1 if the case that must fail has not failed by its figures:
+    then no verdict counts.
 
     Args:
         out: Folder of the table. More cases, samplers and seeds may be added to it later.

@@ -14,6 +14,7 @@ OUR_KIND = "MLP"
 """Kind of the default gate."""
 SMALL_OURS = "small MLP (ours)"
 """The small gate of that kind, which the trained field taught."""
+OURS_NEVER_FROZEN = "our own gate was not frozen with every seed"
 SPARSE = "sparse points"
 """What is near one of the scene's is kept. In tables, not in pictures: it mostly keeps far more."""
 BYTES_A_NUMBER = 2
@@ -161,7 +162,7 @@ def verdict(representations: Sequence[Representation]) -> str:
     seeds do not tell apart is said to be level, or undecided."""
     ours = [one for one in representations if one.ours]
     if not ours:
-        return "our own gate was not frozen with every seed"
+        return OURS_NEVER_FROZEN
     learned, *small = ours
     said = [_standing_of(one, representations) for one in (*small, learned)]
     return f"{'. '.join(said)} ({learned.against(learned, 'kept').by})"
@@ -171,7 +172,7 @@ def shortest_verdict(representations: Sequence[Representation]) -> str:
     """The best that holds for one of ours."""
     ours = [one for one in representations if one.ours]
     if not ours:
-        return "our own gate was not frozen with every seed"
+        return OURS_NEVER_FROZEN
     for one in ours:
         others = [other for other in representations if other is not one]
         if all(one.kept <= other.kept for other in others):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from leco_plugin.chart.contender import Protocol, shared_method, short_names
+from leco_plugin.chart.contender import LEARNED, Protocol, shared_method, short_names
 from leco_plugin.evaluation.report import describe_cores
 from leco_plugin.log import counted
 
@@ -154,7 +154,7 @@ class Line:
     @property
     def learned(self) -> bool:
         """Whether it uses a learned occupancy."""
-        return self.sampler.startswith("learned-occupancy")
+        return self.sampler.startswith(LEARNED)
 
     @property
     def psnrs(self) -> list[float]:

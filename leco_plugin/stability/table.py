@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from leco_plugin.chart.summary import sentence
 from leco_plugin.chart.table import rows
 from leco_plugin.chart.theme import LIGHT, Theme, new_figure, save_picture, save_whole
 from leco_plugin.log import counted
@@ -95,7 +96,7 @@ def headline(results: Results) -> str:
 
 def titles(results: Results) -> tuple[str, str]:
     title, _, below = headline(results).partition("; ")
-    return title[:1].upper() + title[1:], below[:1].upper() + below[1:]
+    return sentence(title), sentence(below)
 
 
 def _count_passes(results: Results) -> str:

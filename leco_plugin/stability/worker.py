@@ -33,7 +33,7 @@ from leco_plugin.evaluation.report import finite_or_null
 from leco_plugin.evaluation.timed_run import render_rays
 from leco_plugin.samplers.registry import build_estimator
 from leco_plugin.stability.photographs import TRUTH
-from leco_plugin.stability.plan import DENSE_LEVELS
+from leco_plugin.stability.plan import DENSE_LEVELS, Sizes
 from leco_plugin.studio.host_models import true_colours
 
 NEAR = 0.03
@@ -81,7 +81,7 @@ def run_cell(
         config, contender, seed, data, protocol, folder, on_progress, looked_at=False
     )
     options = contender.changes.get("occupancy.options", {})
-    measured, shown = measure(trainer.pipeline, data, options.get("samples", 192))
+    measured, shown = measure(trainer.pipeline, data, options.get("samples", Sizes.dense_samples))
     Image.fromarray(shown).save(folder / "view.png")
     figures = asdict(measured)
     found = {
