@@ -138,7 +138,8 @@ def timed_run(
         FloatingPointError: the PSNR at the end is no number.
     """
     trainer = set_up(config, budget, seed)
-    if (curve_points or images) and len(trainer.pipeline.datamanager.eval_dataset) == 0:
+    manager: Any = trainer.pipeline.datamanager
+    if (curve_points or images) and len(manager.eval_dataset) == 0:
         raise InputError("the scene has no test image, on which runs could be compared")
     run = TimedRun(config.method_name or "", sampler, seed)
     model = trainer.pipeline.model
