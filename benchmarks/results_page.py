@@ -32,6 +32,7 @@ from page_parts import (
 )
 from page_pictures import GROWTH, LEARNING, draw_pictures, is_stale, pictures
 from profile_page import profile_sections
+from promises import kept_promises, promises_section
 from readme_parts import (
     GAIN_CHART,
     GIFTS_CHART,
@@ -101,6 +102,8 @@ MORE = """## Further
 - **Is a grid enough?**{star} {capacity} [Gates and grids at equal
   loss](measurements.md#how-much-a-scene-needs-gates-and-grids-at-equal-loss). {grids}
   ([figures](measurements.md#sharpened-occupancies)).
+- **Is what is promised of new views kept?** {promises}, where one in ten may
+  ([figures](measurements.md#what-new-views-lose-and-what-is-promised)).
 - **Does it fail, and when?** {stability} The learned runs have 200 steps
   more, 2.1 times the rays, sparse points, and begin opaque; proposal networks fail by samples
   beside the surface, hardly by PSNR. [Stability](stability.md) shows each case.
@@ -305,6 +308,7 @@ def page() -> str:
         "star": star("capacity"),
         "capacity": where_it_pays(scene_results("capacity")),
         "grids": kept_by_grids(json.loads((RESULTS / "sharpening.json").read_text())),
+        "promises": kept_promises(json.loads((RESULTS / "promises.json").read_text())),
         "stability": sentence(headline(stability)),
     }
     return "\n".join([*parts, MORE.format(**found)])
@@ -322,6 +326,7 @@ def measurements_page() -> str:
         parts += learning_section(json.loads(learning.read_text()))
     if (sharpened := RESULTS / "sharpening.json").exists():
         parts += sharpening_sections(json.loads(sharpened.read_text()))
+    parts += promises_section(json.loads((RESULTS / "promises.json").read_text()))
     if (profiled := RESULTS / "profile.json").exists():
         parts += profile_sections(json.loads(profiled.read_text()))
     parts += sizes_sections()

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import statistics
 import time
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from page_parts import machine_line, made_line, size, span, table
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from leco_plugin.capacity.evidence import Evidence, gather
+from leco_plugin.capacity.evidence import Evidence, Rendered, gather
 from leco_plugin.capacity.measuring import taught_grid
 from leco_plugin.capacity.sources import (
     Seen,
@@ -52,7 +53,7 @@ from leco_plugin.learning.sharpening import (
 )
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.mixture import Mixture
-from leco_plugin.models.rendering import Rays
+from leco_plugin.models.rendering import Intervals, Rays
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.learning_data import on_black
 
@@ -71,7 +72,7 @@ def shown(measured: Measured) -> dict[str, float]:
     return {name: round(float(getattr(measured, name)), 6) for name in SHOWN}
 
 
-class Rendered:
+class Priced:
     """Some rays as prices are measured on them, rendered once for all that are asked."""
 
     def __init__(self, mixture: Mixture, seen: Seen) -> None:
@@ -94,7 +95,7 @@ def taught_by(source: Source, mixture: Mixture) -> dict[str, Any]:
     tests = draw_test_rays(source, occupancy, RAYS)
     assert tests is not None
     losses, calibration = model.config.gate_loss, model.config.calibration
-    on_held_out, on_tests = (Rendered(mixture, seen) for seen in (held_out, tests))
+    on_held_out, on_tests = (Priced(mixture, seen) for seen in (held_out, tests))
     rows, grids = [], []
     for seed in range(SEEDS):
         taught = rays_that_teach(source, occupancy, seed)
@@ -172,9 +173,11 @@ def at_equal_loss(source: Source, mixture: Mixture) -> list[dict[str, Any]]:
     lesson = lessons[0]
     tests = draw_test_rays(source, occupancy, RAYS)
     assert tests is not None
+    of_tests, rendered = gather(mixture, None, tests)
     evidence: dict[str, Evidence] = {
         "held_out": gather(mixture, None, draw_held_out(source, occupancy, RAYS, parts=1)[0])[0],
-        "test": gather(mixture, None, tests)[0],
+        "test": of_tests,
+        "confirmed": confirmed(mixture, of_tests, rendered),
     }
     places = reached_volume(mixture, lesson.mapped, PLACES, seed=5)
     rivals = {
@@ -195,6 +198,25 @@ def at_equal_loss(source: Source, mixture: Mixture) -> list[dict[str, Any]]:
         rows.append(row)
         print(f"  {row}", flush=True)
     return rows
+
+
+@torch.no_grad()
+def confirmed(mixture: Mixture, evidence: Evidence, rendered: Sequence[Rendered]) -> Evidence:
+    """The same evidence, in which only rays have surfaces whose pixel is better rendered with them
+    than without: before the others the field has floaters."""
+    of_rays, first = [], 0
+    for one in rendered:
+        last = first + int(one.before_backdrop.sum())
+        rest = torch.ones_like(one.before_backdrop)
+        rest[one.before_backdrop] = evidence.worth[first:last] == 0.0
+        without = mixture.shade(one.rays, Intervals(*(part[rest] for part in one.intervals))).rgb
+        errors = [(rgb - one.truth).square().sum(dim=-1) for rgb in (one.rgb, without)]
+        of_rays.append(errors[0] < errors[1])
+        first = last
+    worth = evidence.worth * torch.cat(of_rays)[evidence.ray_indices]
+    share = float(worth.sum()) / max(float(evidence.worth.sum()), 1e-12)
+    print(f"  photographs confirm {share:.1%} of the weight near surfaces", flush=True)
+    return evidence._replace(worth=worth)
 
 
 def row_of(run: Path, data: Path) -> dict[str, Any]:
@@ -221,9 +243,12 @@ def sharpening_sections(report: dict[str, Any]) -> list[str]:
         " | by the best grid, taught alike | surface lost on test rays",
         [_guided_row(scene, found["at_end"]) for scene, found in scenes],
     )
-    equal = table(
-        "scene | learned gate | small gate | best grid up to 256³, taught alike",
-        [_equal_row(scene, found) for scene, found in scenes],
+    equal, right = (
+        table(
+            "scene | learned gate | small gate | best grid up to 256³, taught alike",
+            [_equal_row(scene, found, kind) for scene, found in scenes],
+        )
+        for kind in ("test", "confirmed")
     )
     return [
         "## Sharpened occupancies\n",
@@ -234,12 +259,16 @@ def sharpening_sections(report: dict[str, Any]) -> list[str]:
         "are of candidates on held-out rays, at the calibrated thresholds; losses are of what the "
         "learned gate keeps. Seconds of one core are for teaching and calibrating. Grids of 32³ to "
         "256³ cells have the same lessons and the same rule, as they are, dilated by a cell, or "
-        "interpolated between cells too; the one that skips most counts.\n",
+        "interpolated between cells too; the one that skips most counts. Where 0% is skipped, the "
+        "learned gate has left too little of the bound for any threshold: it stays then.\n",
         *guided,
         f"\nAt {LOST:g} of the surface lost *on test rays*, by the field at freezing: volume kept "
         "of what rays reach; candidates kept on those rays; bytes. Of the same grids the one that "
         "keeps least.\n",
         *equal,
+        "\nThe same where only rays count whose photograph is better rendered with their surface "
+        "than without it. Before the others the field has floaters.\n",
+        *right,
         "",
     ]
 
@@ -288,24 +317,24 @@ def _guided_row(scene: str, found: dict[str, Any]) -> list[str]:
     ]
 
 
-def _equal_row(scene: str, found: dict[str, Any]) -> list[str]:
+def _equal_row(scene: str, found: dict[str, Any], kind: str) -> list[str]:
     rows = {row["name"]: row for row in found["at_equal_loss"]}
     small = [row for name, row in rows.items() if name.startswith("small gate")]
     best = min(
         (row for name, row in rows.items() if name.startswith("grid")),
-        key=lambda row: row["test"]["volume"],
+        key=lambda row: row[kind]["volume"],
     )
     return [
         scene,
-        _kept([rows["learned gate"]]),
-        _kept(small),
-        f"{_kept([best])} ({best['name'][5:]})",
+        _kept([rows["learned gate"]], kind),
+        _kept(small, kind),
+        f"{_kept([best], kind)} ({best['name'][5:]})",
     ]
 
 
-def _kept(rows: list[dict[str, Any]]) -> str:
+def _kept(rows: list[dict[str, Any]], kind: str) -> str:
     volume, candidates = (
-        spread([row["test"][name] for row in rows], ".1%") for name in ("volume", "candidates")
+        spread([row[kind][name] for row in rows], ".1%") for name in ("volume", "candidates")
     )
     return f"{volume}; {candidates}; {size(rows[0]['bytes'] / 1e3)}"
 

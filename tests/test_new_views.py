@@ -1,0 +1,53 @@
+"""Claims about what new views lose: whose surfaces count, and who loses more than was promised."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import promises
+import torch
+from sharpening import confirmed
+
+from leco_plugin.capacity.evidence import Evidence, Rendered
+from leco_plugin.models.rendering import Intervals
+
+
+def test_surfaces_count_where_the_photograph_is_worse_without_them() -> None:
+    """Two rays end in white, of which one photograph is black: a floater stands before it."""
+    haze, surface = 0.1, 0.8
+    worth = torch.tensor([0.0, surface, 0.0, surface])
+    indices = torch.tensor([0, 0, 1, 1])
+    known = Evidence(torch.rand(4, 3), indices, worth >= 0.0, worth + haze, worth, 2)
+    with_backdrops = torch.tensor([0, 0, 0, 1, 1, 1])
+    before = torch.tensor([True, True, False] * 2)
+    intervals = Intervals(with_backdrops, torch.arange(6.0), torch.arange(6.0) + 1.0)
+    white, truth = torch.ones(2, 3), torch.tensor([[1.0], [0.0]]).expand(2, 3)
+    drawn: list[Intervals] = []
+
+    def shade(_: Any, some: Intervals) -> Any:
+        drawn.append(some)
+        return SimpleNamespace(rgb=torch.zeros(2, 3))
+
+    mixture: Any = SimpleNamespace(shade=shade)
+    rays: Any = None
+    found = confirmed(mixture, known, [Rendered(rays, intervals, before, white, truth)])
+    assert drawn[0].t_starts.tolist() == [0.0, 2.0, 3.0, 5.0]
+    assert found.worth.tolist() == [0.0, worth[1], 0.0, 0.0]
+    assert found.weights.equal(known.weights)
+
+
+def test_a_photograph_at_its_bound_is_within_it() -> None:
+    assert promises.beyond({"promised": {"bound": 2e-3}, "lost": [0.0, 2e-3, 2.1e-3]}) == 1
+    row = {
+        "promised": {"count": 9, "bound": 2e-3, "confidence": 0.9},
+        "lost": [0.0, 3e-3, 1e-3],
+        "lost_to_gate": [0.0, 1e-3, 1e-3],
+        "code": {"version": "1", "commit": "abc", "sources": "def"},
+        "date": "2024-02-29",
+    }
+    machine = {"cpu": "a", "cores": 2, "threads": 1, "device": "cpu"}
+    said = "\n".join(promises.promises_section({"machine": machine, "scenes": {"town": row}}))
+    assert "Of 3 test photographs on 1 scene 1 loses more of its surfaces than was promised" in said
+    assert "it adds 0.2% at most" in said
+    assert "| town | 0.20% | 90% | 1 of 3 | 0.10% | 0.30% |" in said
