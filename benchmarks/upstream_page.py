@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 
 import checkout  # noqa: F401
-from chart_sections import notes, stored
+from chart_sections import notes, star, stored
 from page_parts import ROOT, between, table
 
 from leco_plugin.chart.summary import MEMORY, RENDERING, Line, lines_of, sentence
@@ -44,9 +44,7 @@ def page(text: str) -> str:
         rows += [[f"`{method}`{mark}", *_cells(guided)], ["", *_cells(other)]]
         seeds |= {len(guided.runs), len(other.runs)}
     count = " or ".join(str(some) for some in sorted(seeds))
-    below = BELOW.format(seeds=count, better="".join(better)) + OLD * any(
-        name in notes() for name in CHARTS.values()
-    )
+    below = BELOW.format(seeds=count, better="".join(better)) + OLD * bool(star(*CHARTS.values()))
     return between(text, MARKS, "\n".join([*table(HEAD, rows), below]))
 
 

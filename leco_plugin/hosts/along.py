@@ -181,10 +181,10 @@ class Along:
         if found is None or found.empty_fraction <= skipped:
             note(f"{what} skips no more within its bounds than the {skipped:.1%} that are skipped")
             return
-        costs = found.on_top_of(before.report)
-        say(f"{what} {costs.line} in all, where {skipped:.1%} were skipped")
+        say(f"{what} {found.line_beside(before.report, skipped)}")
+        costs = found.on_top_of(before.report)._asdict()
         known = {name: value for name, value in before.report.items() if name not in OF_A_GATE}
-        report = {**known, **costs._asdict(), "step": step, "learned": "along"}
+        report = {**known, **costs, "step": step, "learned": "along"}
         report |= {"params": sum(p.numel() for p in gate.parameters())}
         report |= {"train_seconds": round(self.spent + seconds, 2), "calibration_rays": len(truth)}
         made = before.with_gate(gate, found.threshold, report)

@@ -106,6 +106,10 @@ class Measured(NamedTuple):
         errors = {name: math.hypot(getattr(self, name), known[name]) for name in ERRORS}
         return self._replace(**costs, **errors)
 
+    def line_beside(self, before: Mapping[str, Any], skipped: float) -> str:
+        """The same in the words of the log, beside the share that was skipped before."""
+        return f"{self.on_top_of(before).line} in all, where {skipped:.1%} were skipped"
+
     def within(self, config: CalibrationConfig) -> bool:
         """Whether neither price is found to be beyond its bound, by `SURE` standard errors, nor
         beyond `MOST` times the bound at all.

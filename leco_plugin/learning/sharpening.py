@@ -174,8 +174,7 @@ class Sharpened(NamedTuple):
         """What it does, in the words of the log. The costs of what has guided so far, whose report
         this is, are among its own."""
         end = "" if self.pays else "; that is no more, and the gate stays"
-        both = self.measured.on_top_of(report).line
-        return f"{both} in all, where {self.before.empty_fraction:.1%} were skipped{end}"
+        return self.measured.line_beside(report, self.before.empty_fraction) + end
 
     def report(self, before: dict[str, Any], learned: GateConfig) -> dict[str, Any]:
         """The report of an occupancy of this gate.
