@@ -248,10 +248,11 @@ class Along:
         they have left of the bounds is kept for later gates, which a better field teaches; the last
         gate of a run may spend all."""
         config = self.config.calibration
-        left = 0.0 if last else 0.5
-        bounds = {name: getattr(config, name) for name in BOUNDED}
-        spent = {name: max(0.0, float(report.get(name) or 0.0)) for name in BOUNDED}
-        return replace(config, **{n: b + left * (spent[n] - b) for n, b in bounds.items()})
+        bounds: dict[str, Any] = {name: getattr(config, name) for name in BOUNDED}
+        for name, bound in bounds.items():
+            left = max(0.0, bound - max(0.0, float(report.get(name) or 0.0)))
+            bounds[name] = bound if last else bound - 0.5 * left
+        return replace(config, **bounds)
 
     def _calibrated(
         self, gate: Gate, heard: Heard, bundle: Any, truth: Tensor, config: CalibrationConfig

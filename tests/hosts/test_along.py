@@ -142,6 +142,15 @@ def test_what_costs_too_much_in_the_image_is_not_followed(made: Any) -> None:
     assert not list(made.out.iterdir())
 
 
+def test_a_gate_leaves_half_of_what_is_not_spent_and_nothing_where_more_is(made: Any) -> None:
+    config = made.teacher.config.calibration
+    spent = {"lost_surface_mass": None, "image_price_db": 2.0 * config.image_price_db}
+    allowed = made.teacher._allowed(spent, last=False)
+    assert allowed.lost_surface_mass == 0.5 * config.lost_surface_mass
+    assert allowed.image_price_db == config.image_price_db, "no higher than what was promised"
+    assert made.teacher._allowed(spent, last=True) == config
+
+
 def test_all_its_gates_together_cost_no_more_than_the_bound(
     made: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
