@@ -76,9 +76,8 @@ class LecoCity(Nerfstudio):
         self, split: str = "train", **kwargs: Any
     ) -> DataparserOutputs:
         from leco_plugin.scenes.city.folder import POINTS as FILE
-        from leco_plugin.scenes.coloured_points import read_cloud
+        from leco_plugin.scenes.coloured_points import points_in_model, read_cloud
         from leco_plugin.scenes.frames import METRES_PER_UNIT, UP_IS_KNOWN, parsed_frame
-        from leco_plugin.scenes.photographs import points_in_model
 
         outputs: DataparserOutputs = super()._generate_dataparser_outputs(split)
         points = read_cloud(self.config.data / FILE)

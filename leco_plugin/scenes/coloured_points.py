@@ -7,19 +7,32 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from nerfstudio.cameras.cameras import CameraType
 from numpy.typing import NDArray
+from torch import Tensor
 
+from leco_plugin.log import say
+from leco_plugin.scenes.frames import (
+    METRES_PER_UNIT,
+    POINTS,
+    applied_in,
+    from_file,
+    moved,
+    parsed_frame,
+)
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.lenses import lens_of
 from leco_plugin.scenes.photograph_files import find_file
-from leco_plugin.scenes.scene_file import file_in, load_json, poses_in
+from leco_plugin.scenes.scene_file import SceneFile, file_in, load_json, poses_in
 from leco_plugin.scenes.whole_files import FETCH, is_pointer
 
 CONFIG = "config.yml"
 NEAREST = 3
 """Points whose colours are averaged."""
 GREY = 128
+COLOURS = "points3D_rgb"
+"""That of their colours, uint8 [P, 3]. nerfstudio's pipelines want both or neither."""
 
 
 class ColouredPoints(NamedTuple):
@@ -187,3 +200,54 @@ def georeference(description: Path) -> dict[str, Any]:
     """`geographic_origin` and `metres_per_unit` of a transforms.json, where it has them."""
     meta = load_json(description)
     return {name: meta[name] for name in ("geographic_origin", "metres_per_unit") if name in meta}
+
+
+def read_points(meta: dict[str, Any], folder: Path) -> CloudFile | None:
+    """Sparse points in the coordinates of the file, or None. A file that is named and not there, or
+    empty, is said, for learning without points is slower. InputError if it cannot be read."""
+    name = meta.get("ply_file_path")
+    if name is None:
+        return None
+    path = find_file(folder / str(name))
+    if not path.is_file():
+        say(f"the scene names sparse points that are not there: {path}")
+        return None
+    points = read_cloud(path)
+    if len(points.positions) == 0:
+        say(f"{path} has no points; `leco points` finds some in the photographs")
+        return None
+    return points
+
+
+def points_in_model(points: CloudFile, frame: Tensor) -> dict[str, Tensor]:
+    """Sparse points and colours as metadata of nerfstudio's readers, taken to the model by a frame
+    [3, 4]: splatfacto starts there, from grey ones where the file has no colours."""
+    positions, colours = points
+    if colours is None:
+        colours = np.full(positions.shape, GREY, np.uint8)
+    in_model = moved(torch.from_numpy(positions), frame.double()).float()
+    return {POINTS: in_model, COLOURS: torch.from_numpy(colours)}
+
+
+def told_by(scene: SceneFile, data: Path, outputs: Any) -> dict[str, Any]:
+    """What a transforms.json says beside its photographs, as metadata of what nerfstudio's reader
+    made of it: sparse points, unless the reader has read them, and metres. InputError if it cannot
+    be read."""
+    meta = scene.meta
+    try:
+        applied, applied_scale = applied_in(meta, data)
+        frame = from_file(parsed_frame(outputs), applied, applied_scale, torch.float64)
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise InputError(f"{data} cannot be read: {one_line(error, 120)}") from None
+    told: dict[str, Any] = {}
+    if (
+        POINTS not in outputs.metadata
+        and (points := read_points(meta, scene.path.parent)) is not None
+    ):
+        told |= points_in_model(points, frame)
+    if "metres_per_unit" in meta:
+        metres = meta["metres_per_unit"]
+        if type(metres) not in (int, float) or not 0.0 < metres < float("inf"):
+            raise InputError(f"{data}: metres_per_unit is {metres!r}, not a positive number")
+        told[METRES_PER_UNIT] = applied_scale * float(metres)
+    return told

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from leco_plugin.log import bar, note
-from leco_plugin.scenes.coloured_points import read_cloud
+from leco_plugin.scenes.coloured_points import points_in_model, read_cloud
 from leco_plugin.scenes.frames import ALTITUDES, METRES_PER_UNIT, UP_IS_KNOWN
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.large_coordinates import far_origin, with_transform
@@ -38,7 +38,6 @@ from leco_plugin.scenes.photograph_files import (
     open_image,
     plain,
 )
-from leco_plugin.scenes.photographs import points_in_model
 from leco_plugin.scenes.pt_file import describe, load, read_bytes
 
 if TYPE_CHECKING:

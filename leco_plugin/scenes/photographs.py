@@ -9,32 +9,20 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from numpy.typing import NDArray
-from torch import Tensor
 
-from leco_plugin.log import say
-from leco_plugin.scenes.coloured_points import GREY, CloudFile, read_cloud
 from leco_plugin.scenes.frames import (
-    METRES_PER_UNIT,
-    POINTS,
     UP_IS_KNOWN,
-    applied_in,
-    from_file,
-    moved,
-    parsed_frame,
 )
-from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.large_coordinates import ReadsNear
 from leco_plugin.scenes.photograph_files import check_images, find_file
 from leco_plugin.scenes.reading import CheckedReader
 from leco_plugin.scenes.scene_file import SceneFile, file_in, load_json, poses_in, scene_file_of
 
-COLOURS = "points3D_rgb"
-"""That of their colours, uint8 [P, 3]. nerfstudio's pipelines want both or neither."""
 HeldOut = Literal["spread", "stretch"]
 """Which photographs are tested: some all over the scene, or a whole line or arc of them."""
 
@@ -69,20 +57,8 @@ class LecoPhotographs(CheckedReader, ReadsNear, Nerfstudio):
         if len(outputs.image_filenames) == 0 and split == "train":
             none = f"{data}: no image is left for the split {split!r}"
             raise InputError(f"{none}: list some in train_filenames, or remove it")
-        try:
-            applied, applied_scale = applied_in(meta, data)
-            frame = from_file(parsed_frame(outputs), applied, applied_scale, torch.float64)
-        except (ValueError, TypeError, RuntimeError) as error:
-            raise InputError(f"{data} cannot be read: {one_line(error, 120)}") from None
-        if (points := read_points(meta, folder_of(data))) is not None:
-            outputs.metadata |= points_in_model(points, frame)
         if up_is_known:
             outputs.metadata[UP_IS_KNOWN] = True
-        if "metres_per_unit" in meta:
-            metres = meta["metres_per_unit"]
-            if type(metres) not in (int, float) or not 0.0 < metres < float("inf"):
-                raise InputError(f"{data}: metres_per_unit is {metres!r}, not a positive number")
-            outputs.metadata[METRES_PER_UNIT] = applied_scale * float(metres)
         return outputs
 
     def _near(self, meta: dict[str, Any]) -> dict[str, Any]:
@@ -131,33 +107,6 @@ def read_scene(data: Path) -> SceneFile:
     assert scene is not None
     check_images(scene.pictures())
     return scene
-
-
-def read_points(meta: dict[str, Any], folder: Path) -> CloudFile | None:
-    """Sparse points in the coordinates of the file, or None. A file that is named and not there, or
-    empty, is said, for learning without points is slower. InputError if it cannot be read."""
-    name = meta.get("ply_file_path")
-    if name is None:
-        return None
-    path = find_file(folder / str(name))
-    if not path.is_file():
-        say(f"the scene names sparse points that are not there: {path}")
-        return None
-    points = read_cloud(path)
-    if len(points.positions) == 0:
-        say(f"{path} has no points; `leco points` finds some in the photographs")
-        return None
-    return points
-
-
-def points_in_model(points: CloudFile, frame: Tensor) -> dict[str, Tensor]:
-    """Sparse points and colours as metadata of nerfstudio's readers, taken to the model by a frame
-    [3, 4]: splatfacto starts there, from grey ones where the file has no colours."""
-    positions, colours = points
-    if colours is None:
-        colours = np.full(positions.shape, GREY, np.uint8)
-    in_model = moved(torch.from_numpy(positions), frame.double()).float()
-    return {POINTS: in_model, COLOURS: torch.from_numpy(colours)}
 
 
 def describe_held_out(data: Path, kind: HeldOut) -> dict[str, Any]:

@@ -19,10 +19,12 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers import base_dataparser
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 from PIL import UnidentifiedImageError
 
 from leco_plugin.log import bar, by_number, counted, say
 from leco_plugin.scenes import photograph_files, scene_file
+from leco_plugin.scenes.coloured_points import told_by
 from leco_plugin.scenes.frames import check_poses
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.large_coordinates import near_bases
@@ -52,6 +54,8 @@ class CheckedReader(DataParser):
         try:
             read = super().get_dataparser_outputs(split=split, **options)
             outputs = checked(read, config, split, scene)
+            if scene is not None and isinstance(self, Nerfstudio):
+                outputs.metadata |= told_by(scene, config.data, outputs)
             if outputs.image_filenames and outputs.alpha_color is None:
                 path = Path(outputs.image_filenames[0])
                 self._first[header_of(path).transparent] = path, split

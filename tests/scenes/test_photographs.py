@@ -13,21 +13,28 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 from scene_files import change, refused
 
-from leco_plugin.scenes.coloured_points import coloured_points, read_cloud
-from leco_plugin.scenes.frames import METRES_PER_UNIT, data_frame_of, inverse, moved, parsed_frame
-from leco_plugin.scenes.photographs import (
+from leco_plugin.scenes.coloured_points import coloured_points, read_cloud, read_points
+from leco_plugin.scenes.frames import (
+    METRES_PER_UNIT,
     POINTS,
+    data_frame_of,
+    inverse,
+    moved,
+    parsed_frame,
+)
+from leco_plugin.scenes.photographs import (
     LecoPhotographsDataParserConfig,
     describe_scene,
-    read_points,
     read_scene,
     taken_from_above,
 )
 from leco_plugin.scenes.poses.georeference import write_sparse_points
 from leco_plugin.scenes.poses.points import find_points
+from leco_plugin.scenes.reading import with_checks
 from leco_plugin.scenes.whole_files import write_points
 
 LISTS = ("train_filenames", "val_filenames", "test_filenames")
@@ -171,16 +178,18 @@ def earlier(scene: Path) -> None:
 def test_sparse_points_follow_the_cameras_into_model_coordinates(
     scene: Path, process: Callable[[Path], None]
 ) -> None:
-    """A point at each camera's position lies at that camera's position after parsing."""
+    """A point at each camera's position lies at that camera's position after parsing, by whatever
+    reader of the format: a host of any data manager learns its occupancy with these points."""
     meta = read_scene(scene).meta
     places = np.array([frame["transform_matrix"] for frame in meta["frames"]])[:, :3, 3]
     trimesh.PointCloud(places).export(scene / "points.ply")
     change(scene, lambda m: m.update(ply_file_path="points.ply"))
     process(scene)
-    outputs = outputs_of(scene)
-    distances = torch.cdist(outputs.cameras.camera_to_worlds[:, :, 3], outputs.metadata[POINTS])
-    assert len(outputs.metadata[POINTS]) == 9
-    assert float(distances.amin(dim=1).max()) < 1e-5
+    stock: Any = with_checks(NerfstudioDataParserConfig(data=scene)).setup()
+    for outputs in (outputs_of(scene), stock.get_dataparser_outputs()):
+        distances = torch.cdist(outputs.cameras.camera_to_worlds[:, :, 3], outputs.metadata[POINTS])
+        assert len(outputs.metadata[POINTS]) == 9
+        assert float(distances.amin(dim=1).max()) < 1e-5
 
 
 def test_a_held_out_stretch_leaves_the_way_back_to_the_file_as_it_is(scene: Path) -> None:

@@ -11,8 +11,9 @@ import pytest
 from PIL import Image
 
 from leco_plugin.scenes.city.cameras import Lens, look_at
+from leco_plugin.scenes.coloured_points import read_points
 from leco_plugin.scenes.frames import distance_from_rotations
-from leco_plugin.scenes.photographs import read_points, read_scene
+from leco_plugin.scenes.photographs import read_scene
 from leco_plugin.stability.photographs import (
     STAGES,
     TRUTH,

@@ -16,10 +16,11 @@ from PIL import Image
 
 from leco_plugin.log import bar, counted
 from leco_plugin.scenes.bounds import FEWEST_POINTS
+from leco_plugin.scenes.coloured_points import read_points
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.lenses import DISTORTIONS, MIXED, Lens
 from leco_plugin.scenes.photograph_files import decode, find_file, header_of, is_turned, seen_pixels
-from leco_plugin.scenes.photographs import read_points, read_scene
+from leco_plugin.scenes.photographs import read_scene
 from leco_plugin.scenes.poses.georeference import points_of, write_sparse_points
 from leco_plugin.scenes.poses.originals import FEWEST, Exif, Photograph
 from leco_plugin.scenes.poses.reconstruction import (

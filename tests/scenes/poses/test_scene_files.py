@@ -11,8 +11,9 @@ import pytest
 from PIL import Image
 from scene_files import read_ply
 
+from leco_plugin.scenes.coloured_points import read_points
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig, read_points
+from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 from leco_plugin.scenes.poses import ASKED
 from leco_plugin.scenes.poses.command import _finished
 from leco_plugin.scenes.poses.georeference import (
