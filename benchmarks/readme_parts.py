@@ -118,7 +118,7 @@ def without_gifts(results: Mapping[str, Any]) -> str:
         alone = f"at {listed(ended)}" + (f" ({alone})" if failed else "")
     return (
         "**Part of Instant-NGP's lead** is how its run begins. In another test, of "
-        f"{len(whole.psnrs)} seeds, runs end at {listed(whole.psnrs)} dB with all of it; with gate "
+        f"{len(whole.psnrs)} seeds, runs end at {listed(whole.psnrs)} dB as they are; with gate "
         f"and bounds alone {alone}; with its own grid at {listed(own.psnrs)} "
         "([more](docs/results.md#what-is-gained-in-the-same-time))."
     )

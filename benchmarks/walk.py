@@ -116,8 +116,8 @@ def quote(report: dict[str, Any]) -> str:
             block(chosen),
             "",
             f"All three took {minutes:.0f} minutes on two CPU cores. A learned gate skipped first, "
-            "then its smaller successor. Together they hide "
-            f"{costs['lost_surface_mass']:.2%} of the surfaces that held-out pixels show; of "
+            "then its smaller successor. Both together hide "
+            f"{costs['lost_surface_mass']:.2%} of the surfaces in held-out pixels. Of "
             f"{photographs} that taught them nothing, the worst lost {worst[0]:.1%}"
             + "".join(f" ({other:.1%} in another run)" for other in worst[1:])
             + ".",

@@ -44,7 +44,7 @@ def test_the_readme_says_what_skipping_costs_and_what_another_run_lost() -> None
     assert said.startswith("```\nstep 9: a gate of 7 values\n2 of 3 are placed\n```\n\n")
     assert "took 3 minutes" in said and "hide 0.08%" in said
     assert said.endswith(
-        "of photographs that taught them nothing, the worst lost 1.3% (2.1% in another run)."
+        "Of photographs that taught them nothing, the worst lost 1.3% (2.1% in another run)."
     )
     lines["train"].append("8 photographs that taught it nothing lose at most 1.28% of theirs")
-    assert " show; of 8 photographs that taught them nothing, the worst" in walk.quote(report)
+    assert " pixels. Of 8 photographs that taught them nothing, the worst" in walk.quote(report)

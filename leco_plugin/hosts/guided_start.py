@@ -39,9 +39,9 @@ KEPT_POINTS = 0.5
 """Share of a scene's sparse points that an occupancy of the scene keeps at least."""
 
 LEARNING = (
-    "the occupancy is learned first, and is in no checkpoint until then: a run that is stopped "
-    "before starts over. A run of leco-occupancy can be gone on with, and its folder be given here "
-    "with --pipeline.model.occupancy.path"
+    "the occupancy is learned first, in steps of its own. It is in no checkpoint until then: a run "
+    "that is stopped before starts over. A run of leco-occupancy can be gone on with, and its folder "
+    "be given here with --pipeline.model.occupancy.path (leco swap: --occupancy)"
 )
 
 OWN_SAMPLER = "own"
