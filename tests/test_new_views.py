@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import promises
+import pytest
 import torch
+from nerfstudio.data.datasets.base_dataset import InputDataset
 from sharpening import confirmed
 
 from leco_plugin.capacity.evidence import Evidence, Rendered
+from leco_plugin.capacity.sources import find_source
+from leco_plugin.cli_occupancy import occupancy_of
 from leco_plugin.models.rendering import Intervals
+from leco_plugin.occupancy import CAMERAS_THAT_VOUCH
 
 
 def test_surfaces_count_where_the_photograph_is_worse_without_them() -> None:
@@ -51,3 +58,22 @@ def test_a_photograph_at_its_bound_is_within_it() -> None:
     assert "Of 3 test photographs on 1 scene 1 loses more of its surfaces than was promised" in said
     assert "it adds 0.2% at most" in said
     assert "| town | 0.20% | 90% | 1 of 3 | 0.10% | 0.30% |" in said
+
+
+def test_each_test_photograph_is_decoded_once(
+    known_run: Path, tiny_scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = find_source(occupancy_of(known_run), tiny_scene)
+    frozen = source.mixture
+    assert frozen is not None
+    frozen.report[CAMERAS_THAT_VOUCH] = {"count": 2, "bound": 2e-3, "confidence": 0.6}
+    monkeypatch.setattr(promises, "find_source", lambda *_: source._replace(frozen=frozen))
+    decode, decoded = InputDataset.get_numpy_image, Counter[int]()
+
+    def counted(dataset: InputDataset, number: int) -> Any:
+        decoded[number] += 1
+        return decode(dataset, number)
+
+    monkeypatch.setattr(InputDataset, "get_numpy_image", counted)
+    found = promises.row_of(known_run, tiny_scene)
+    assert len(found["lost"]) == 2 and decoded == {0: 1, 1: 1}

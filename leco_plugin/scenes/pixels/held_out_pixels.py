@@ -117,9 +117,14 @@ def sizes_of(pictures: Any) -> Tensor:
     return torch.tensor([picture.shape[:2] for picture in pictures])
 
 
-def some_images(dataset: Any, most: int = 16) -> dict[str, Any]:
-    """A batch of up to so many images of nerfstudio's `InputDataset`, spread evenly."""
-    chosen = torch.linspace(0, len(dataset) - 1, min(most, len(dataset))).long().unique()
+def some_numbers(dataset: Any, most: int = 16) -> Tensor:
+    """Numbers of up to so many images of a dataset, spread evenly: [P] int64."""
+    return torch.linspace(0, len(dataset) - 1, min(most, len(dataset))).long().unique()
+
+
+def some_images(dataset: Any) -> dict[str, Any]:
+    """A batch of `some_numbers` of the images of nerfstudio's `InputDataset`."""
+    chosen = some_numbers(dataset)
     read = [dataset.get_data(number) for number in chosen.tolist()]
     images = {key: [data[key] for data in read] for key in ("image", "mask") if key in read[0]}
     return images | {"image_idx": chosen}
