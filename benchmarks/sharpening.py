@@ -51,6 +51,7 @@ from leco_plugin.learning.sharpening import (
     sharpen,
     teach,
 )
+from leco_plugin.log import counted
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.rendering import Intervals, Rays
@@ -160,8 +161,9 @@ def interpolated(scores: Tensor, box: ViewBox, mapped: Tensor) -> Tensor:
     return grid_sample(*given, align_corners=False, padding_mode="border").flatten()
 
 
-def at_equal_loss(source: Source, mixture: Mixture) -> list[dict[str, Any]]:
-    """Volume that is kept where `LOST` of the surface mass is lost, on two kinds of rays."""
+def at_equal_loss(source: Source, mixture: Mixture) -> tuple[list[dict[str, Any]], float]:
+    """Volume that is kept where `LOST` of the surface mass is lost, on three kinds of rays; and the
+    share of the weight near surfaces of test rays that photographs confirm."""
     model, config = source.model, SharpeningConfig()
     assert model is not None
     occupancy = mixture.occupancy().eval()
@@ -174,10 +176,11 @@ def at_equal_loss(source: Source, mixture: Mixture) -> list[dict[str, Any]]:
     tests = draw_test_rays(source, occupancy, RAYS)
     assert tests is not None
     of_tests, rendered = gather(mixture, None, tests)
+    right, share = confirmed(mixture, of_tests, rendered)
     evidence: dict[str, Evidence] = {
         "held_out": gather(mixture, None, draw_held_out(source, occupancy, RAYS, parts=1)[0])[0],
         "test": of_tests,
-        "confirmed": confirmed(mixture, of_tests, rendered),
+        "confirmed": right,
     }
     places = reached_volume(mixture, lesson.mapped, PLACES, seed=5)
     rivals = {
@@ -197,13 +200,16 @@ def at_equal_loss(source: Source, mixture: Mixture) -> list[dict[str, Any]]:
             row[kind] = {"volume": round(kept[0], 5), "candidates": round(kept[1], 5)}
         rows.append(row)
         print(f"  {row}", flush=True)
-    return rows
+    return rows, share
 
 
 @torch.no_grad()
-def confirmed(mixture: Mixture, evidence: Evidence, rendered: Sequence[Rendered]) -> Evidence:
+def confirmed(
+    mixture: Mixture, evidence: Evidence, rendered: Sequence[Rendered]
+) -> tuple[Evidence, float]:
     """The same evidence, in which only rays have surfaces whose pixel is better rendered with them
-    than without: before the others the field has floaters."""
+    than without: before the others the field has floaters. And the share of the worth that stays.
+    """
     of_rays, first = [], 0
     for one in rendered:
         last = first + int(one.before_backdrop.sum())
@@ -215,8 +221,7 @@ def confirmed(mixture: Mixture, evidence: Evidence, rendered: Sequence[Rendered]
         first = last
     worth = evidence.worth * torch.cat(of_rays)[evidence.ray_indices]
     share = float(worth.sum()) / max(float(evidence.worth.sum()), 1e-12)
-    print(f"  photographs confirm {share:.1%} of the weight near surfaces", flush=True)
-    return evidence._replace(worth=worth)
+    return evidence._replace(worth=worth), share
 
 
 def row_of(run: Path, data: Path) -> dict[str, Any]:
@@ -228,10 +233,13 @@ def row_of(run: Path, data: Path) -> dict[str, Any]:
         raise SystemExit(
             f"{run} is sharpened already: train with --pipeline.model.sharpening.steps 0"
         )
+    at_end = taught_by(source, source.model.mixture.eval())
+    rows, share = at_equal_loss(source, source.frozen)
     return {
         "learned_params": sum(p.numel() for p in source.frozen.gate.parameters()),
-        "at_end": taught_by(source, source.model.mixture.eval()),
-        "at_equal_loss": at_equal_loss(source, source.frozen),
+        "at_end": at_end,
+        "at_equal_loss": rows,
+        "confirmed_share": round(share, 4),
     }
 
 
@@ -250,6 +258,10 @@ def sharpening_sections(report: dict[str, Any]) -> list[str]:
         )
         for kind in ("test", "confirmed")
     )
+    # rows that were made before shares were stored have none
+    shares = [found["confirmed_share"] for _, found in scenes if "confirmed_share" in found]
+    where = f"of the weight on {counted(len(shares), 'scene')}"
+    confirm = f" Photographs confirm {span(shares, '.0%')} {where}." if shares else ""
     return [
         "## Sharpened occupancies\n",
         "`python benchmarks/sharpening.py RUN=SCENE ...`, of runs of `ns-train leco-occupancy "
@@ -267,7 +279,7 @@ def sharpening_sections(report: dict[str, Any]) -> list[str]:
         "keeps least.\n",
         *equal,
         "\nThe same where only rays count whose photograph is better rendered with their surface "
-        "than without it. Before the others the field has floaters.\n",
+        f"than without it. Before the others the field has floaters.{confirm}\n",
         *right,
         "",
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,7 +12,8 @@ import promises
 import pytest
 import torch
 from nerfstudio.data.datasets.base_dataset import InputDataset
-from sharpening import confirmed
+from page_parts import RESULTS
+from sharpening import confirmed, sharpening_sections
 
 from leco_plugin.capacity.evidence import Evidence, Rendered
 from leco_plugin.capacity.sources import find_source
@@ -38,10 +40,21 @@ def test_surfaces_count_where_the_photograph_is_worse_without_them() -> None:
 
     mixture: Any = SimpleNamespace(shade=shade)
     rays: Any = None
-    found = confirmed(mixture, known, [Rendered(rays, intervals, before, white, truth)])
+    found, share = confirmed(mixture, known, [Rendered(rays, intervals, before, white, truth)])
     assert drawn[0].t_starts.tolist() == [0.0, 2.0, 3.0, 5.0]
     assert found.worth.tolist() == [0.0, worth[1], 0.0, 0.0]
-    assert found.weights.equal(known.weights)
+    assert found.weights.equal(known.weights) and share == 0.5
+
+
+def test_what_photographs_confirm_is_said_of_scenes_that_store_it() -> None:
+    report = json.loads((RESULTS / "sharpening.json").read_text())
+    scenes = [*report["scenes"].values()]
+    for found in scenes:
+        found.pop("confirmed_share", None)
+    assert "Photographs confirm" not in "".join(sharpening_sections(report))
+    scenes[0]["confirmed_share"], scenes[1]["confirmed_share"] = 0.51, 0.64
+    said = "Photographs confirm 51% to 64% of the weight on 2 scenes."
+    assert said in "".join(sharpening_sections(report))
 
 
 def test_a_photograph_at_its_bound_is_within_it() -> None:
