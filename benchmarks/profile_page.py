@@ -23,7 +23,7 @@ def profile_sections(report: dict[str, Any]) -> list[str]:
     rows = [row for methods in report["scenes"].values() for row in methods.values()]
     parts = [
         "## Where the time of a step goes\n",
-        "`python benchmarks/profile.py --data SCENE --methods METHOD ...`; "
+        "`python benchmarks/profile_steps.py --data SCENE --methods METHOD ...`; "
         f"{machine_line(report)}. Rows {made_line(rows)}.\n",
         "Milliseconds of a training step, forward + backward, and of a rendered view of 480 x 360. "
         "A backward operation belongs to the part whose forward has made its node. The *floor* is "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import sys
 from collections.abc import Iterator
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
@@ -207,3 +208,10 @@ def test_no_file_is_long() -> None:
 def test_no_function_is_long_but_those_that_are_named() -> None:
     """What is short again leaves the list."""
     assert long_functions() == LONG_FUNCTIONS
+
+
+@pytest.mark.parametrize("folder", ["benchmarks", "examples", "tests"])
+def test_no_program_hides_a_module_of_the_standard_library(folder: str) -> None:
+    """Python puts the folder of a program before all others."""
+    names = {path.stem for path in (ROOT / folder).glob("*.py")}
+    assert names & sys.stdlib_module_names == set()

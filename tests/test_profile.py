@@ -1,8 +1,7 @@
-"""Claims about `benchmarks/profile.py`: to which part time belongs, and what it must cost."""
+"""Claims about `benchmarks/profile_steps.py`: to which part time belongs, and what it must cost."""
 
 from __future__ import annotations
 
-import cProfile
 import time
 from typing import Any
 
@@ -106,7 +105,3 @@ def test_the_page_says_what_takes_most() -> None:
     phase["parts"]["of a later code"] = small
     text = "\n".join(profile_sections({"machine": {}, "scenes": {"city": {"leco-ngp": row}}}))
     assert "| of a later code | 1.00 | - |" in text
-
-
-def test_the_standard_library_keeps_its_profile() -> None:
-    assert callable(cProfile.runctx)

@@ -1,4 +1,4 @@
-"""Where the time of a step goes: `python benchmarks/profile.py --data SCENE --methods ...`.
+"""Where the time of a step goes: `python benchmarks/profile_steps.py --data SCENE --methods ...`.
 
 Each method trains once on a scene. Profiled are some steps while it learns its occupancy, some once
 that guides it, and the rendering of one test view. Hosts learn an occupancy first, or take that of
