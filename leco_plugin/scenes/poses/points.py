@@ -39,6 +39,7 @@ FILE, BEFORE = "leco_points.ply", "transforms.before_points.json"
 """The points, and transforms.json as it was, in the folder of the scene."""
 TOLERANCE = 0.01
 """Share of a picture's longest side by which a feature may miss its point; COLMAP has 4 pixels."""
+NO_POINTS = "undistort the photographs, or give bounds.altitudes, or near and far, without points"
 BYTES_A_SQUARE = 2.0
 """Of a copy as PNG, over the square of its longest side: four scenes took 0.9 to 1.2."""
 CONTRADICTED = 0.5
@@ -198,16 +199,22 @@ def _seen(scene: SceneFile, number: int, path: Path, image: Image.Image) -> Imag
 
 def camera_of(lens: Lens, full: tuple[int, int], size: tuple[int, int], where: str) -> Any:
     """A camera of pycolmap: a lens in pixels of its full size (width, height), scaled to the size
-    of a copy. InputError for other lenses than perspective and fisheye, or without focal length."""
+    of a copy. InputError for other lenses than perspective and fisheye, without focal length, or
+    with a distortion that pycolmap's cameras lack."""
     focal = lens.focal_lengths(*full, factor=1)
     if lens.kind not in (None, *MIXED) or focal[0] is None or focal[1] is None:
         raise InputError(
-            f"{where}: leco points needs a perspective or fisheye lens with a focal length; give "
-            "bounds.altitudes, or near and far, in place of points"
+            f"{where}: leco points needs a perspective or fisheye lens with a focal length: "
+            f"{NO_POINTS}"
         )
     said = dict(zip(DISTORTIONS, lens.distortion or [0.0] * len(DISTORTIONS)))
     fisheye = lens.kind is CameraType.FISHEYE
     names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    if lacking := [name for name, value in said.items() if value and name not in names]:
+        raise InputError(
+            f"{where}: leco points knows no {' and '.join(lacking)} of a "
+            f"{'fisheye' if fisheye else 'perspective lens'}: {NO_POINTS}"
+        )
     across, down = size[0] / full[0], size[1] / full[1]
     middle = [at if at is not None else side / 2 for at, side in zip((lens.cx, lens.cy), full)]
     pinhole = [focal[0] * across, focal[1] * down, middle[0] * across, middle[1] * down]

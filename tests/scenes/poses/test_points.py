@@ -160,7 +160,10 @@ def test_a_camera_is_scaled_with_its_copy(pycolmap: Any) -> None:
     camera = camera_of(lens_of(meta, {}, "a.jpg"), (800, 600), (400, 300), "a.jpg")
     assert camera.params[:8].tolist() == [250, 255, 195, 155, 0.1, 0, 0, 0.02]
     fisheye = camera_of(
-        lens_of(meta | {"camera_model": "OPENCV_FISHEYE"}, {}, "a.jpg"), (800, 600), (800, 600), ""
+        lens_of(meta | {"camera_model": "OPENCV_FISHEYE", "p2": 0}, {}, "a.jpg"),
+        (800, 600),
+        (800, 600),
+        "",
     )
     assert fisheye.model.name == "OPENCV_FISHEYE" and fisheye.params[4] == 0.1
     panorama = lens_of({"w": 800, "h": 400, "camera_model": "EQUIRECTANGULAR"}, {}, "a.jpg")
@@ -169,6 +172,20 @@ def test_a_camera_is_scaled_with_its_copy(pycolmap: Any) -> None:
         InputError, match=r"a\.jpg: leco points needs a perspective or fisheye lens"
     ):
         camera_of(panorama, (800, 400), (800, 400), "a.jpg")
+
+
+@pytest.mark.parametrize(
+    ("model", "name", "said"),
+    [("OPENCV", "k4", "k4 of a perspective lens"), ("OPENCV_FISHEYE", "p1", "p1 of a fisheye")],
+)
+def test_distortion_that_pycolmap_lacks_is_refused(
+    model: str, name: str, said: str, pycolmap: Any
+) -> None:
+    """nerfstudio undoes it: points would be placed by another lens than rays."""
+    meta = {"w": 800, "h": 600, "fl_x": 500, "fl_y": 510, "cx": 390, "cy": 310}
+    lens = lens_of(meta | {"camera_model": model, name: 0.01}, {}, "a.jpg")
+    with pytest.raises(InputError, match=rf"a\.jpg: leco points knows no {said}: undistort"):
+        camera_of(lens, (800, 600), (800, 600), "a.jpg")
 
 
 def test_pairs_by_pose_are_near_ones_that_look_the_same_way() -> None:
