@@ -1,4 +1,4 @@
-"""The code of docs/own-loop.md runs as it stands, and its frame leads where it says."""
+"""The code of README.md and docs/own-loop.md runs as it stands; the frame leads where it says."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from leco_plugin.samplers.registry import OURS
 from leco_plugin.scenes.frames import APPLIED_EARLIER
 from leco_plugin.space import Space
 
-PAGE = (Path(__file__).parents[2] / "docs" / "own-loop.md").read_text()
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "own-loop.md").read_text()
 SAMPLING, MOVING = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 SCALE = 0.01
 
@@ -89,6 +90,16 @@ def test_its_code_samples_in_the_scenes_coordinates_and_in_the_photographs(
     )
     assert rays.equal(given["ray_indices"])
     torch.testing.assert_close(t_starts * SCALE, given["t_starts"], rtol=1e-3, atol=1e-4)
+
+
+def test_the_code_of_the_readme_needs_no_more_than_a_file(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(file.parent)
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    given: dict[str, Any] = {}
+    exec(code, given)
+    assert given["kept"].dtype == torch.bool and len(given["kept"]) == len(given["t_starts"])
 
 
 def test_it_names_the_samplers_of_packed_hosts() -> None:
