@@ -52,9 +52,10 @@ well: rates fall to a tenth over whatever time is given.
 
 TIMES = """### How long the suites take
 
-Minutes of all runs of a suite on two cores, each from the start of its process to its end, two at a
-time; together, runs that several suites share are counted once. Each was to take less than 45 and
-all of them together 240.
+Minutes of all runs of a suite on two cores, two at a time, each from the start of its process to
+its end. They are the processor's, in one thread: other programs do not lengthen them. Together,
+runs that several suites share are counted once. Each was to take less than 45 and all of them
+together 240.
 """
 
 

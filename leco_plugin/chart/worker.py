@@ -212,6 +212,7 @@ def main(folder: Path, run: Make = run_job) -> int:
     def make(job: dict[str, Any], show: Callable[[float], None]) -> dict[str, Any]:
         contender, protocol = Contender.from_dict(job["contender"]), Protocol(**job["protocol"])
         found = run(contender, job["seed"], Path(job["data"]), protocol, folder, show)
+        # the name that stored charts have; in one thread on a CPU they are the processor's
         return {**found, "code": code, "wall_seconds": round(seconds_now() - started, 1)}
 
     return work_on(folder, make)
