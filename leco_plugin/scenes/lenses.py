@@ -15,7 +15,7 @@ from leco_plugin.scenes.input_error import InputError
 DISTORTIONS = ("k1", "k2", "k3", "k4", "p1", "p2")
 """In the order of nerfstudio's `distortion_params`."""
 PINHOLE_FIELDS = ("w", "h", "fl_x", "fl_y", "cx", "cy")
-ANGLES = ("x_fov", "y_fov", "camera_angle_x", "camera_angle_y", "fovx", "fovy")
+ANGLES = ("x_fov", "y_fov", "camera_angle_x", "camera_angle_y")
 """Fields of view: what instant-ngp and Blender write beside or instead of focal lengths."""
 SHORTEST = 0.05
 """Of the width, the least focal length: a plane would show 169 degrees, and no lens bends so."""

@@ -230,11 +230,13 @@ READ = LENS_FIELDS | {
 NEEDLESS = {
     *("aabb", "aabb_scale", "blur_score", "colmap_im_id", "colmap_image_id", "depth_file_path"),
     *("depth_path", "depth_unit_scale_factor", "enable_depth_loading", "enable_ray_loading"),
-    *("geographic_origin", "importance_sampling", "integer_depth_scale", "n_extra_learnable_dims"),
-    *("offset", "render_aabb", "rotation", "scale", "sharpness", "timestamp"),
+    *("fovx", "fovy", "geographic_origin", "importance_sampling", "integer_depth_scale"),
+    *("n_extra_learnable_dims", "offset", "render_aabb", "rotation", "scale", "sharpness"),
+    "timestamp",
 }
 """Neither geometry nor colour depends on them: bounds come from cameras and points, and our methods
-learn without depths. `rotation` is by how much Blender turned the camera, as poses say too."""
+learn without depths. No reader knows `fovx`, each wants a focal length or another angle. `rotation`
+is by how much Blender turned the camera, as poses say too."""
 
 
 def unused_fields(meta: dict[str, Any]) -> list[str]:

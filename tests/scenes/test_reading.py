@@ -223,6 +223,13 @@ def test_fields_of_view_go_for_both_axes(scene: Path) -> None:
     with refused(r"has no fl_x; .*instant-ngp-data"):
         read(LecoPhotographsDataParserConfig(data=scene))
 
+    def rename(meta: dict[str, Any]) -> None:
+        meta |= {"fovx": meta.pop("camera_angle_x"), "fovy": meta.pop("camera_angle_y")}
+
+    change(scene, rename)  # no reader knows these
+    with refused(r"has no fl_x: add it"):
+        read(LecoPhotographsDataParserConfig(data=scene))
+
 
 @pytest.mark.parametrize("reader", OF_A_FILE)
 def test_every_reader_of_a_file_reads_is_fisheye(reader: str, scene: Path) -> None:
