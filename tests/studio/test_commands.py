@@ -38,11 +38,17 @@ for number, (arguments, code) in enumerate(programs):
     if child == 0:
         os.dup2(os.open(f"{log}{number}", os.O_CREAT | os.O_WRONLY), 2)
         sys.argv = arguments
-        exec(code)
-        sys.exit()
+        try:
+            exec(code)
+        except BaseException:
+            sys.excepthook(*sys.exc_info())
+            sys.stderr.flush()
+            os._exit(1)
+        os._exit(0)
     print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 """
-"""Runs each program of a list, as the arguments and the code of a process of Python."""
+"""Runs each program of a list, as the arguments and the code of a process of Python. A fork reports
+its error as Python does, but does not take down what was imported, which takes three seconds."""
 RAISE = """
 from leco_plugin.scenes.input_error import InputError
 import leco_plugin.method_configs
