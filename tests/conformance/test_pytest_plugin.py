@@ -26,16 +26,18 @@ def folder(tmp_path_factory) -> Path:
     return write_distribution(tmp_path_factory.mktemp("installed"), section)
 
 
-def run(folder: Path, work: Path, *asked: tuple[str, ...]) -> list[tuple[int, str]]:
+def run(
+    folder: Path, work: Path, *asked: tuple[str, ...], first: str = ""
+) -> list[tuple[int, str]]:
     """Exit status and output of each of these runs of pytest, one after another in one process.
 
-    Warnings are errors, and the working directory is a folder of its own.
+    Warnings are errors, and the working directory is a folder of its own. Code may run `first`.
     """
     path = os.pathsep.join([str(folder), str(ROOT / "tests"), str(ROOT)])
     strict = ["-W", "error", "-p", "no:dash", "-p", "no:cacheprovider", "-v"]
     runs = [[*strict, *arguments] for arguments in asked]
     done = subprocess.run(
-        [sys.executable, "-c", SEVERAL_RUNS, json.dumps(runs)],
+        [sys.executable, "-c", first + SEVERAL_RUNS, json.dumps(runs)],
         cwd=work,
         env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
         stdout=subprocess.PIPE,
@@ -71,7 +73,8 @@ def answers(folder, tmp_path_factory) -> dict[tuple[str, ...], tuple[int, str]]:
     """Exit status and output by options; in one process, for each would import nerfstudio."""
     asked = [CHECKED, *REFUSED]
     work = tmp_path_factory.mktemp("work")
-    return dict(zip(asked, run(folder, work, *((*PYARGS, *options) for options in asked))))
+    runs = [(*PYARGS, *options) for options in asked]
+    return dict(zip(asked, run(folder, work, *runs, first="import quick_imports")))
 
 
 def test_one_test_a_rule_and_seam(answers):
