@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import checkout  # noqa: F401
 import pytest
 import quick_imports  # noqa: F401
+import quick_seeds  # noqa: F401
 import tiny_scene as tiny_scene_writer
 import torch
 
@@ -123,7 +124,7 @@ def forks() -> None:
     context = multiprocessing.get_context("forkserver")
     models = ["leco_plugin.hosts.guided", "nerfstudio.models.instant_ngp"]  # what ranks build
     context.set_forkserver_preload(
-        ["quick_imports", *ours, "leco_plugin.conformance.cases", *models]
+        ["quick_imports", "quick_seeds", *ours, "leco_plugin.conformance.cases", *models]
     )
     paths = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
     with pytest.MonkeyPatch.context() as patch:
