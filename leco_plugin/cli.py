@@ -5,6 +5,8 @@ Each subcommand imports what it needs inside, so that help comes at once.
 
 from __future__ import annotations
 
+import atexit
+import gc
 import io
 import shlex
 import sys
@@ -230,6 +232,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs `leco`: 0, or one line on stderr and 2 for bad input, 1 for a failure."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     about = "Learned occupancy for nerfstudio: what is empty is skipped."
+    atexit.register(gc.freeze)  # else a command searches all that it imported for cycles: seconds
     if isinstance(sys.stdout, io.TextIOWrapper):  # names of files need not be UTF-8
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
