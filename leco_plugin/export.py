@@ -318,12 +318,7 @@ def export_folder(
 
         return _part(folder, name, write, use)
 
-    def drawn() -> Facts:
-        colours = scene_colours(occupancy, description)
-        draw(occupancy, folder / "occupancy.png", colours=colours)
-        write_page(occupancy, folder / "occupancy.html", colours)
-        return {"photograph_colours": colours is not None}
-
+    drawn = functools.partial(_draw_pictures, occupancy, folder, description)
     splats = folder / "splats.json"
     picture = "slices of o(x), and the kept points"
     parts = [
@@ -349,6 +344,17 @@ def export_folder(
     if all(part.facts is None for part in parts):
         raise ValueError(f"nothing can be exported: {parts[0].said}")
     return parts, doubts(describe(occupancy))
+
+
+def _draw_pictures(occupancy: Occupancy, folder: Path, description: Path | None) -> Facts:
+    """Writes the picture and the page of the folder."""
+    with bar("Drawing pictures") as show:
+        colours = scene_colours(occupancy, description)
+        draw(occupancy, folder / "occupancy.png", colours=colours)
+        show(0.75)  # of 3.4 s
+        write_page(occupancy, folder / "occupancy.html", colours)
+        show(1.0)
+    return {"photograph_colours": colours is not None}
 
 
 def _part(folder: Path, name: str, write: Callable[[], Facts], use: Callable[[Facts], str]) -> Part:

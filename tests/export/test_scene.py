@@ -185,7 +185,9 @@ def test_a_folder_has_everything_and_says_what_each_part_is_for(
 
     monkeypatch.setattr("leco_plugin.export.bar", noted)
     parts, doubted = export_folder(file, folder, 32, scene)
-    assert len(asked) == 2  # the surface once, for points and splats, and the volume
+    # the pictures, the surface once, for points and splats, and the volume
+    gate = "Asking the gate about cells of 1/32"
+    assert asked == ["Drawing pictures", gate, gate]
     names = ["occupancy.png", "occupancy.html", "kept.ply", "splats.json", "volume.npz"]
     assert [part.name for part in parts if part.facts] == names and not doubted
     assert {path.name for path in folder.iterdir()} == {*names, "splats.ply"}
