@@ -40,8 +40,8 @@ KEPT_POINTS = 0.5
 
 LEARNING = (
     "the occupancy is learned first, in steps of its own. It is in no checkpoint until then: a run "
-    "that is stopped before starts over. A run of leco-occupancy can be gone on with, and its folder "
-    "be given here with --pipeline.model.occupancy.path (leco swap: --occupancy)"
+    "that is stopped before starts over. A run of leco-occupancy can be gone on with, and its "
+    "folder be given here with --pipeline.model.occupancy.path (leco swap: --occupancy)"
 )
 
 OWN_SAMPLER = "own"
