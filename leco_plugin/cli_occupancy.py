@@ -13,6 +13,9 @@ from leco_plugin.scenes.whole_files import check_picture, check_place, write_rep
 if TYPE_CHECKING:
     from leco_plugin.occupancy import Occupancy
 
+PAGE = ".html"
+"""Ending of the page beside a picture."""
+
 
 def occupancy_of(path: Path) -> Path:
     """The file that is meant: itself, or the newest occupancy in a folder of runs. ValueError if
@@ -54,6 +57,7 @@ def inspect(
     """
     check_place("--json", json)
     check_picture("--picture", picture)
+    check_place("--picture", None if picture is None else picture.with_suffix(PAGE))
     check_picture("--history", history, moving=True)
     if picture is None and (dark or data is not None):
         raise ValueError("--data and --dark are about the picture: give --picture FILE")
@@ -216,7 +220,7 @@ def _draw(occupancy: Occupancy, picture: Path, description: Path | None, dark: b
 
     colours = scene_colours(occupancy, description)
     print(f"drew {draw(occupancy, picture, colours=colours, theme=DARK if dark else LIGHT)}")
-    page = write_page(occupancy, picture.with_suffix(".html"), colours)
+    page = write_page(occupancy, picture.with_suffix(PAGE), colours)
     print(f"drew {page}, to look around in with a browser")
     if colours is None:
         why = "no coloured sparse points are known (--data SCENE)"

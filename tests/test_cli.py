@@ -275,6 +275,43 @@ def test_a_place_that_cannot_be_written_to_is_named_before_anything_is_read_or_w
     assert {path.name for path in tmp_path.iterdir()} == {"text.safetensors", "taken.png"}
 
 
+@pytest.mark.parametrize(
+    ("option", "name", "command"),
+    [
+        ("--json", "x.json", ["check", "grit"]),
+        ("--picture", "x.png", ["inspect", "none.safetensors"]),
+        ("--history", "x.gif", ["inspect", "none.safetensors"]),
+        ("--out", "kept.ply", ["export", "text.safetensors", "--format", "ply"]),
+        ("--out", "kept", ["export", "text.safetensors"]),
+        ("--out", "city", ["city"]),
+        ("--out", "demo", ["demo"]),
+        ("--out", "table", ["stability"]),
+    ],
+)
+def test_a_place_that_takes_no_new_file_is_named_before_the_work(
+    option: str,
+    name: str,
+    command: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("text.safetensors").write_text("not an occupancy")
+    assert run(*command, option, Path("/proc", name)) == 2  # which root may write to, by its rights
+    said = capsys.readouterr()
+    assert said.err.startswith("leco: nothing can be written into /proc"), said.err
+    assert said.err.endswith(f"name another folder with {option}\n") and not said.out
+
+
+def test_a_page_that_cannot_be_written_beside_its_picture_is_named_before_the_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "x.html").mkdir()
+    assert run("inspect", tmp_path / "none.safetensors", "--picture", tmp_path / "x.png") == 2
+    assert capsys.readouterr().err.endswith("x.html is a folder; give a file\n")
+
+
 @pytest.mark.parametrize("option", ["--picture", "--history"])
 def test_a_kind_of_picture_that_cannot_be_drawn_is_named_before_the_file_is_read(
     option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

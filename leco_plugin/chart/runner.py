@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from leco_plugin.evaluation.report import read_object
 from leco_plugin.scenes.input_error import InputError, one_line
-from leco_plugin.scenes.locks import LOCK, alone_in
+from leco_plugin.scenes.locks import LOCK, alone_in, writing_into
 from leco_plugin.scenes.whole_files import write_json
 
 if TYPE_CHECKING:
@@ -120,7 +120,7 @@ def take_folder(
         words: what is said of a folder with another value of a setting, by its name, instead of
             `holds` and both values.
     Raises:
-        InputError: it holds something else, or has other settings; nothing was written.
+        InputError: it holds something else, has other settings, or cannot be written; nothing was.
     """
     folder = file.parent
     if file.is_file():
@@ -131,7 +131,8 @@ def take_folder(
     elif folder.exists() and (not folder.is_dir() or set(os.listdir(folder)) - {LOCK}):
         raise InputError(f"{folder} holds something else; name a new folder with --out")
     else:
-        write_json(file, dict(settings))
+        with writing_into(folder, "--out"):
+            write_json(file, dict(settings))
 
 
 def difference(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str | None:

@@ -8,7 +8,11 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any, BinaryIO
+
+from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.locks import writing_into
 
 if TYPE_CHECKING:  # `leco --help` loads no numpy for it
     from numpy.typing import NDArray
@@ -83,21 +87,21 @@ def write_points(path: Path, rows: NDArray[Any], comments: Sequence[str] = ()) -
 
 
 def check_place(option: str, path: Path | None) -> None:
-    """ValueError if a file cannot be written there: it is a folder, or one of its folders is a file
-    or cannot be written to."""
+    """InputError if a file cannot be written there: it is a folder, or one of its folders is a file
+    or takes no new file. Tries it with a file that has no name, as rights do not say all."""
     if path is None:
         return
     if path.is_dir():
-        raise ValueError(f"{option} {path} is a folder; give a file")
+        raise InputError(f"{option} {path} is a folder; give a file")
     nearest = next(folder for folder in path.absolute().parents if folder.exists())
     if not nearest.is_dir():
-        raise ValueError(f"{option} {path}: {nearest} is a file, not a folder")
-    if not os.access(nearest, os.W_OK):
-        raise ValueError(f"{option} {path}: {nearest} cannot be written to")
+        raise InputError(f"{option} {path}: {nearest} is a file, not a folder")
+    with writing_into(nearest, option), TemporaryFile(dir=nearest):
+        pass
 
 
 def check_picture(option: str, path: Path | None, moving: bool = False) -> None:
-    """As `check_place`; ValueError too for an unknown kind of picture. A `moving` one may be a
+    """As `check_place`; InputError too for an unknown kind of picture. A `moving` one may be a
     .gif."""
     check_place(option, path)
     if path is None:
@@ -106,4 +110,4 @@ def check_picture(option: str, path: Path | None, moving: bool = False) -> None:
 
     kinds = {*FigureCanvasBase.get_supported_filetypes(), *(["gif"] if moving else [])}
     if path.suffix[1:].lower() not in kinds:
-        raise ValueError(f"{option} {path} ends in none of {', '.join(sorted(kinds))}")
+        raise InputError(f"{option} {path} ends in none of {', '.join(sorted(kinds))}")

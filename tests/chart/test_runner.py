@@ -69,6 +69,12 @@ def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path: Path) ->
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
+def test_a_folder_that_cannot_be_made_is_named_with_the_remedy() -> None:
+    line = r"^nothing can be written into /proc/chart .*: name another folder with --out$"
+    with pytest.raises(InputError, match=line):
+        RunFolder(Path("/proc/chart"), SETTINGS)
+
+
 def test_an_empty_folder_is_taken(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     RunFolder(tmp_path / "empty", SETTINGS)

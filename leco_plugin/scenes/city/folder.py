@@ -39,6 +39,7 @@ import leco_plugin
 from leco_plugin.scenes.city.cameras import CaptureConfig, Lens, View, views_of
 from leco_plugin.scenes.city.city import DESCRIPTION, City, CityConfig, read_description
 from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.locks import writing_into
 from leco_plugin.scenes.mega_nerf_files import (
     TO_DRB,
     Coordinates,
@@ -205,7 +206,8 @@ def write_city(
         fault = f"{out_dir} is where a disk is mounted, or where this command runs"
         raise InputError(f"{fault}: give a folder in it")
     unfinished = place.parent / f".{place.name}-unfinished-{digest}"
-    unfinished.mkdir(parents=True, exist_ok=True)
+    with writing_into(out_dir, "--out"):
+        unfinished.mkdir(parents=True, exist_ok=True)
     try:
         _photograph(city, files, unfinished, progress)
         files.finish(unfinished)

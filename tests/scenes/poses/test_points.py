@@ -201,7 +201,10 @@ def test_pairs_by_pose_are_near_ones_that_look_the_same_way() -> None:
 def test_a_scene_that_cannot_be_written_to_is_refused_before_the_work(
     bare: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("leco_plugin.scenes.whole_files.os.access", lambda *_: False)
+    def refuse(dir: Path) -> None:
+        raise PermissionError(13, "Permission denied", str(dir))
+
+    monkeypatch.setattr("leco_plugin.scenes.whole_files.TemporaryFile", refuse)
     monkeypatch.setattr("leco_plugin.scenes.poses.points._copies", None)
-    with pytest.raises(ValueError, match="cannot be written to"):
+    with pytest.raises(InputError, match=r"nothing can be written into .*Permission denied"):
         find_points(bare)
