@@ -22,7 +22,7 @@ import tyro
 
 from leco_plugin.cli_experiments import capacity, chart, check, stability
 from leco_plugin.cli_occupancy import export, inspect, shrink
-from leco_plugin.scenes.input_error import one_line
+from leco_plugin.scenes.input_error import one_line, unknown_name
 from leco_plugin.scenes.whole_files import check_place, write_report
 
 BAD_INPUT, FAILURE = 2, 1
@@ -235,6 +235,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     atexit.register(gc.freeze)  # else a command searches all that it imported for cycles: seconds
     if isinstance(sys.stdout, io.TextIOWrapper):  # names of files need not be UTF-8
         sys.stdout.reconfigure(errors="backslashreplace")
+    if given and given[0][:1] != "-" and given[0] not in COMMANDS:
+        sys.exit(_complain(ValueError(unknown_name("command", given[0], COMMANDS)), BAD_INPUT))
     try:
         with warnings.catch_warnings():
             # what nerfstudio and torch think of each other is nothing that a user can act on

@@ -19,7 +19,7 @@ from leco_plugin.hosts.guided_start import OccupancyConfig, load_occupancy, occu
 from leco_plugin.method_configs import LEARNING, ON_GPU, best_device
 from leco_plugin.models.sizing.sizes import learning_only
 from leco_plugin.samplers.registry import check_gate, refuse_unknown_options
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, unknown_name
 from leco_plugin.scenes.reading import with_checks
 from leco_plugin.studio.dynamic_batch import clamped
 from leco_plugin.studio.processes import DataParallelTrainerConfig
@@ -87,7 +87,7 @@ def registered(method: str) -> TrainerConfig:
     from nerfstudio.configs.method_configs import all_methods
 
     if method not in all_methods:
-        raise InputError(f"there is no method {method!r}; there are {', '.join(all_methods)}")
+        raise InputError(unknown_name("method", method, all_methods))
     config = copy.deepcopy(all_methods[method])
     if not isinstance(config, TrainerConfig):
         raise InputError(f"{method!r} is known by name only: its package is not installed")

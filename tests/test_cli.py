@@ -330,6 +330,25 @@ def test_a_wrong_command_line_is_bad_input_too(arguments: list[str]) -> None:
     assert end.value.code == 2
 
 
+def test_a_misspelt_command_or_name_is_answered_with_the_one_that_it_resembles(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        run("pose", "photos")
+    assert end.value.code == 2
+    said = capsys.readouterr().err
+    assert said.startswith("leco: there is no command 'pose'; did you mean poses? There are city,")
+    assert said.count("\n") == 1
+    for arguments, meant in [
+        (["swap", "nerfact"], "nerfacto"),
+        (["check", "leco-ngpp"], "leco-ngp"),
+        (["check", "occupancy-gird"], "occupancy-grid"),
+        (["swap", "nerfacto", "--sampler", "Dense"], "dense"),
+    ]:
+        assert run(*arguments) == 2
+        assert f"; did you mean {meant}? There are " in capsys.readouterr().err
+
+
 def test_a_swap_whose_arguments_are_not_set_apart_says_how(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

@@ -29,7 +29,7 @@ from leco_plugin.method_configs import LEARNING, ON_GPU
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.switch.field import SwitchNerfModelConfig
 from leco_plugin.samplers.registry import samplers as registered_samplers
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, unknown_name
 from leco_plugin.swap import registered
 
 SIZED_GRID = re.compile(rf"{GRID}-(\d+)")
@@ -96,8 +96,7 @@ def contenders(methods: Sequence[str], samplers: Sequence[str] = ()) -> list[Con
     for sampler in samplers:
         sized = SIZED_GRID.fullmatch(sampler)
         if sampler not in known and not sized:
-            listed = ", ".join(sorted(known))
-            raise InputError(f"there is no sampler {sampler!r}; there are {listed}")
+            raise InputError(unknown_name("sampler", sampler, sorted(known)))
         if sized and int(sized[1]) < 2:
             raise InputError(f"the sampler {sampler!r} has too few cells: {GRID}-2 has the fewest")
     found: dict[str, Contender] = {}
@@ -359,6 +358,5 @@ def in_order(names: Sequence[str]) -> list[str]:
     one."""
     for name in names:
         if name not in SUITES and name != ALL:
-            listed = ", ".join(SUITES)
-            raise InputError(f"there is no suite {name!r}; there are {listed}, and {ALL}")
+            raise InputError(unknown_name("suite", name, [*SUITES, ALL]))
     return [name for name in SUITES if name in names or ALL in names]

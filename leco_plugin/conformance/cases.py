@@ -16,7 +16,7 @@ from leco_plugin.conformance.rules import RULES, Case, Rule, Verdict, apply, lef
 from leco_plugin.conformance.samplers import SamplerCase
 from leco_plugin.conformance.scene import SLAB
 from leco_plugin.samplers.registry import sampler_spec, samplers, why_left_out
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, unknown_name
 
 
 def sampler_cases(name: str) -> list[Case]:
@@ -70,10 +70,7 @@ def cases_of(name: str) -> list[Case]:
     from nerfstudio.configs.method_configs import all_methods
 
     if name not in all_methods:
-        raise ValueError(
-            f"there is no sampler or method {name!r}; there are the samplers "
-            f"{', '.join(sorted(known))} and the methods {', '.join(all_methods)}"
-        )
+        raise ValueError(unknown_name("sampler or method", name, [*sorted(known), *all_methods]))
     return host_cases(name)
 
 

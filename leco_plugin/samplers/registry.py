@@ -16,6 +16,8 @@ from typing import Any, TypeVar
 
 from torch import nn
 
+from leco_plugin.scenes.input_error import known_names, unknown_name
+
 Kind = TypeVar("Kind")
 
 GROUP = "leco_plugin.samplers"
@@ -133,7 +135,7 @@ def sampler_spec(name: str) -> SamplerSpec:
         why = why_left_out(name)
         if why is not None:
             raise ValueError(f"the sampler {name!r} is registered, but {why}")
-        raise ValueError(f"there is no sampler {name!r}; there are {', '.join(sorted(known))}")
+        raise ValueError(unknown_name("sampler", name, sorted(known)))
     return known[name]
 
 
@@ -214,10 +216,8 @@ def refuse_unknown_options(
     known = {option for parameters in takes if parameters for option in parameters} - GIVEN
     if unknown := sorted(set(options) - known):
         here = f" in {HOSTS[kinds[0]]} hosts" if len(kinds) == 1 else ""
-        there_are = ", ".join(sorted(known)) or "none"
-        raise ValueError(
-            f"the sampler {name!r} has no option {unknown[0]!r}{here}; there are {there_are}"
-        )
+        others = known_names(unknown[0], sorted(known))
+        raise ValueError(f"the sampler {name!r} has no option {unknown[0]!r}{here}; {others}")
 
 
 def check_gate(name: str, config: Any) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, unknown_name
 from leco_plugin.stability.photographs import STAGES, Capture
 from leco_plugin.stability.plan import DENSE, GRID, GRIDS, LEARNED, RAYS
 
@@ -248,5 +248,5 @@ def cases_named(names: tuple[str, ...]) -> list[Case]:
     """The cases of names, in the table's order, or all; an `InputError` for an unknown name."""
     unknown = [name for name in names if name not in CASES]
     if unknown:
-        raise InputError(f"there is no case {unknown[0]!r}; there are {', '.join(CASES)}")
+        raise InputError(unknown_name("case", unknown[0], CASES))
     return [case for case in CASES.values() if not names or case.name in names]

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from leco_plugin.chart.contender import Contender, Job
 from leco_plugin.hosts.guided_start import OWN_SAMPLER
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, unknown_name
 from leco_plugin.stability.photographs import STAGES, YARD, Capture
 from leco_plugin.stability.scene import Stage
 
@@ -96,7 +96,7 @@ def samplers_named(names: tuple[str, ...]) -> list[Sampler]:
     an `InputError` for an unknown name."""
     unknown = [name for name in names if name not in SAMPLERS]
     if unknown:
-        raise InputError(f"there is no sampler {unknown[0]!r}; there are {', '.join(SAMPLERS)}")
+        raise InputError(unknown_name("sampler", unknown[0], SAMPLERS))
     return with_references(set(names or SAMPLERS))
 
 
