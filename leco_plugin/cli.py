@@ -14,6 +14,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
+from inspect import signature
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Literal
@@ -22,7 +23,7 @@ import tyro
 
 from leco_plugin.cli_experiments import capacity, chart, check, stability
 from leco_plugin.cli_occupancy import export, inspect, shrink
-from leco_plugin.scenes.input_error import one_line, unknown_name
+from leco_plugin.scenes.input_error import is_like, one_line, unknown_name
 from leco_plugin.scenes.whole_files import check_place, write_report
 
 BAD_INPUT, FAILURE = 2, 1
@@ -237,6 +238,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.reconfigure(errors="backslashreplace")
     if given and given[0][:1] != "-" and given[0] not in COMMANDS:
         sys.exit(_complain(ValueError(unknown_name("command", given[0], COMMANDS)), BAD_INPUT))
+    if given[:1] == ["swap"] and _is_meant_for_training(given[1:]):
+        print(SEPARATE, file=sys.stderr)
+        sys.exit(BAD_INPUT)
     try:
         with warnings.catch_warnings():
             # what nerfstudio and torch think of each other is nothing that a user can act on
@@ -246,16 +250,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
             )
     except (ValueError, OSError) as error:
         return _complain(error, BAD_INPUT)
-    except SystemExit as end:
-        if end.code == BAD_INPUT and given[:1] == ["swap"] and "--" not in given:
-            print(SEPARATE, file=sys.stderr)
-        raise
     except (RuntimeError, FloatingPointError, ImportError) as error:
         return _complain(error, FAILURE)
     except KeyboardInterrupt:
         print("leco: stopped; what had been stored stays", file=sys.stderr)
         return 130
     return 0
+
+
+def _is_meant_for_training(words: Sequence[str]) -> bool:
+    """Whether words after `leco swap` hold an option of ns-train before any `--`: one that neither
+    is an option of `leco swap` nor resembles one."""
+    own = ["--help"]
+    for name in signature(swap).parameters:
+        option = name.replace("_", "-")
+        own += [f"--{option}", f"--no-{option}"]
+    before = words[: words.index("--")] if "--" in words else words
+    named = [word.partition("=")[0].replace("_", "-") for word in before if word[:2] == "--"]
+    return any(not is_like(option, own) for option in named)
 
 
 def _complain(error: BaseException, status: int) -> int:

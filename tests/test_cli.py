@@ -355,8 +355,12 @@ def test_a_swap_whose_arguments_are_not_set_apart_says_how(
     with pytest.raises(SystemExit) as end:
         run("swap", "nerfacto", "--occupancy", "FILE", "--data", "SCENE")
     assert end.value.code == 2
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert last.startswith("leco: ") and "--occupancy FILE -- --data SCENE" in last
+    said = capsys.readouterr().err
+    assert said.startswith("leco: ") and said.endswith("--occupancy FILE -- --data SCENE`\n")
+    assert said.count("\n") == 1
+    with pytest.raises(SystemExit):
+        run("swap", "nerfacto", "--ocupancy", "FILE")
+    assert "--occupancy" in (said := capsys.readouterr().err) and "behind --" not in said
 
 
 def test_a_swap_trains_with_what_is_asked_of_the_sampler_the_codes_and_the_scene(

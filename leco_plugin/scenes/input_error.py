@@ -60,6 +60,11 @@ def known_names(name: str, known: Iterable[str]) -> str:
     return f"{meant} {', '.join(names.values()) or 'none'}"
 
 
+def is_like(name: str, known: Iterable[str]) -> bool:
+    """Whether a name is a known one, or resembles one."""
+    return bool(get_close_matches(name, list(known), 1, LIKE))
+
+
 def require_folder(option: str, path: Path) -> None:
     """InputError if a path is no folder. The option is as it is given, with its dashes."""
     if not path.is_dir():
