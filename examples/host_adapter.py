@@ -1,6 +1,6 @@
 """A HostAdapter for a model that samples in a way of its own: host_adapter.py FILE"""
 
-import sys
+import argparse
 
 import torch
 from nerfstudio.cameras.rays import RayBundle, RaySamples
@@ -28,8 +28,7 @@ class Guided(nn.Module):
         self.sampler = sampler  # a submodule, so that train() and eval() reach it
 
     def forward(self, ray_bundle: RayBundle) -> RaySamples:
-        samples, _weights, _candidates = self.sampler(ray_bundle, density_fns=[])
-        return samples
+        return self.sampler(ray_bundle, density_fns=[])[0]  # its weights and candidates follow
 
 
 def swap(host: MyModel, guide: Guide) -> None:
@@ -42,7 +41,12 @@ def swap(host: MyModel, guide: Guide) -> None:
 ADAPTER = HostAdapter("the sampler of MyModel", lambda host: isinstance(host, MyModel), swap)
 
 if __name__ == "__main__":  # what `leco swap` does once ADAPTER is an entry point
-    occupancy = Occupancy.load(sys.argv[1]) if len(sys.argv) > 1 else sys.exit(__doc__)
+    parser = argparse.ArgumentParser(description=__doc__.partition(":")[0])
+    parser.add_argument("file", help="occupancy.safetensors of a run")
+    try:
+        occupancy = Occupancy.load(parser.parse_args().file)
+    except (OSError, ValueError) as error:
+        parser.error(str(error))
     guide, host = Guide(), MyModel().eval()
     guide.set_occupancy(occupancy)
     away = torch.nn.functional.normalize(torch.randn(256, 3), dim=-1)

@@ -1,7 +1,7 @@
 """Learns the occupancy of a scene, and asks it: learn_an_occupancy.py SCENE OUT [STEPS]"""
 
+import argparse
 import copy
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +10,7 @@ from nerfstudio.scripts.train import main as train
 
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.occupancy import Occupancy
+from leco_plugin.scenes.input_error import InputError
 
 
 def learn(scene: Path, out: Path, steps: int) -> Path:
@@ -42,9 +43,13 @@ def describe(occupancy: Occupancy) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) < 3:
-        sys.exit(__doc__)
-    steps = int(sys.argv[3]) if len(sys.argv) > 3 else 4000
-    file = learn(Path(sys.argv[1]), Path(sys.argv[2]), steps)
+    parser = argparse.ArgumentParser(description=__doc__.partition(":")[0])
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("steps", type=int, nargs="?", default=4000)
+    try:
+        file = learn(**vars(parser.parse_args()))
+    except InputError as error:
+        parser.error(str(error))
     describe(Occupancy.load(file))
     print(f"the occupancy is in {file}")

@@ -1,6 +1,6 @@
 """Learned occupancy in a plain torch + nerfacc loop: plain_torch_nerfacc_loop.py FILE [STEPS]."""
 
-import sys
+import argparse
 
 import nerfacc
 import torch
@@ -10,12 +10,19 @@ from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.nerfacc_cpu import install
 
 install()  # nerfacc alone needs CUDA
-occupancy = Occupancy.load(sys.argv[1]) if len(sys.argv) > 1 else sys.exit(__doc__)
+parser = argparse.ArgumentParser(description=__doc__.partition(":")[0])
+parser.add_argument("file", help="occupancy.safetensors of a run")
+parser.add_argument("steps", type=int, nargs="?", default=200)
+given = parser.parse_args()
+try:
+    occupancy = Occupancy.load(given.file)
+except (OSError, ValueError) as error:
+    parser.error(str(error))
 options = {"far_plane": occupancy.report["far"], "render_step_size": 0.02, "stratified": True}
 estimator = LearnedOccupancyEstimator(occupancy)
 field = torch.nn.Sequential(torch.nn.Linear(3, 64), torch.nn.ReLU(), torch.nn.Linear(64, 4))
 optimizer = torch.optim.Adam(field.parameters(), lr=1e-2)
-for step in range(int(sys.argv[2]) if len(sys.argv) > 2 else 200):
+for step in range(given.steps):
     rays_o = torch.nn.functional.normalize(torch.randn(512, 3), dim=-1)  # your rays here
     rays_d = torch.nn.functional.normalize(0.3 * torch.randn(512, 3) - rays_o, dim=-1)
 

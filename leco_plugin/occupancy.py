@@ -221,6 +221,8 @@ class Occupancy(nn.Module):
         path = Path(path)
         if path.is_dir():
             raise IsADirectoryError(f"{path} is a folder; an occupancy is a file")
+        if not path.exists():
+            raise FileNotFoundError(f"there is no {path}: give the occupancy.safetensors of a run")
         size = path.stat().st_size
         if size > LARGEST_FILE:
             raise ValueError(f"{path} has {size} bytes; an occupancy has at most {LARGEST_FILE}")

@@ -30,6 +30,36 @@ def test_a_program_is_a_page_long_and_is_shown(program: Path) -> None:
     assert f'--8<-- "examples/{program.name}"' in page
 
 
+@pytest.mark.parametrize(
+    ("name", "given", "said"),
+    [
+        ("plain_torch_nerfacc_loop", ["none.safetensors"], "there is no none.safetensors: give"),
+        ("host_adapter", ["none.safetensors"], "there is no none.safetensors: give"),
+        ("learn_an_occupancy", ["none", "runs", "2"], "there is no "),
+        ("learn_an_occupancy", ["none", "runs", "few"], "invalid int value: 'few'"),
+    ],
+)
+def test_a_program_says_in_a_line_what_is_wrong_with_what_it_is_given(
+    name: str,
+    given: list[str],
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    pytest.importorskip("nerfacc")
+    monkeypatch.chdir(tmp_path)
+    script = str(FOLDER / f"{name}.py")
+    for words, status in ((given, 2), (["--help"], 0)):
+        monkeypatch.setattr(sys, "argv", [script, *words])
+        with pytest.raises(SystemExit) as end:
+            runpy.run_path(script, run_name="__main__")
+        assert end.value.code == status
+    told = capsys.readouterr()
+    assert f"{name}.py: error: " in told.err and said in told.err.splitlines()[-1]
+    assert f"usage: {name}.py" in told.out
+
+
 @pytest.mark.xdist_group("commands")
 def test_an_occupancy_is_learned_and_asked(
     command: ForkedCommands, tiny_scene: Path, tmp_path: Path
