@@ -245,7 +245,7 @@ def capacity(
         ValueError, OSError: a folder or a size is wrong; nothing was started.
     """
     _check_options(resolutions, lost_surface_mass, learn_steps)
-    require_folder("--data", data)
+    require_folder(data, "give that of the scene with --data")
     scene, machine, code = describe_scene(data), describe_machine(), describe_code()
     settings = {
         "lost_surface_mass": lost_surface_mass,

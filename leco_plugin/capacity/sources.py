@@ -64,7 +64,7 @@ def find_source(file: Path, data: Path) -> Source:
     Raises:
         InputError: `data` is no folder, or the run's model cannot be loaded.
     """
-    require_folder("--data", data)
+    require_folder(data, "give that of the scene with --data")
     folder = file.resolve().parent
     is_run = (folder / CONFIG).is_file() and any((folder / CHECKPOINTS).glob("step-*.ckpt"))
     if is_run and (source := _load_run(folder, data.resolve())) is not None:

@@ -65,11 +65,12 @@ def is_like(name: str, known: Iterable[str]) -> bool:
     return bool(get_close_matches(name, list(known), 1, LIKE))
 
 
-def require_folder(option: str, path: Path) -> None:
-    """InputError if a path is no folder. The option is as it is given, with its dashes."""
-    if not path.is_dir():
-        instead = ", but a file" if path.exists() else ""
-        raise InputError(f"{option} {path}: there is no such folder{instead}")
+def require_folder(path: Path, remedy: str) -> None:
+    """InputError, with the remedy, if there is no such folder, or it is a file."""
+    if path.exists() and not path.is_dir():
+        raise InputError(f"{path} is a file, not a folder: {remedy}")
+    if not path.exists():
+        raise InputError(f"there is no folder {path}: {remedy}")
 
 
 def one_line(error: BaseException, most: int | None = None) -> str:

@@ -26,7 +26,7 @@ from PIL import Image
 from leco_plugin.log import counted
 from leco_plugin.scenes.city.shapes import Array
 from leco_plugin.scenes.frames import SKEW, distance_from_rotations
-from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.input_error import InputError, require_folder
 from leco_plugin.scenes.photograph_files import open_image
 from leco_plugin.scenes.pt_file import describe, read_pt
 from leco_plugin.scenes.whole_files import write_whole
@@ -172,8 +172,7 @@ def read_scene(
     `check_axes` refuses a world whose first axis does not point down. InputError, in one line,
     names a file and what is wrong with it.
     """
-    if not folder.is_dir():
-        raise InputError(f"there is no folder {folder}; give one with --data")
+    require_folder(folder, "give one with --data")
     coordinates = read_coordinates(folder / "coordinates.pt")
     pairs = sorted(_pairs(folder, "train") + _pairs(folder, "val"), key=lambda pair: pair[0].name)
     for (before, _), (after, _) in pairwise(pairs):

@@ -27,7 +27,7 @@ from PIL import Image
 from leco_plugin.log import bar, note
 from leco_plugin.scenes.coloured_points import points_in_model, read_cloud
 from leco_plugin.scenes.frames import ALTITUDES, METRES_PER_UNIT, UP_IS_KNOWN
-from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.input_error import InputError, one_line, require_folder
 from leco_plugin.scenes.large_coordinates import far_origin, with_transform
 from leco_plugin.scenes.mega_nerf_files import Frame, MegaNerfScene, read_scene
 from leco_plugin.scenes.photograph_files import (
@@ -55,8 +55,8 @@ def read(config: MegaNerfDataParserConfig) -> MegaNerfScene:
                 f"ray_altitude_range is the top and then the ground, in metres along the down axis,"
                 f" so that the first is less: not {top:g} and {ground:g}"
             )
-    if config.masks is not None and not config.masks.is_dir():
-        raise InputError(f"there is no folder {config.masks} with masks")
+    if config.masks is not None:
+        require_folder(config.masks, "give one with masks, or leave --masks out")
     with bar("Reading the scene") as progress:
         scene = read_scene(config.data, config.check_axes, progress)
     note(scene.describe())

@@ -107,7 +107,7 @@ def test_other_settings_and_bad_input_are_refused_in_one_line(
         "another scene": ["--data", other, "--out", out],
         "another learn steps": ["--data", tiny_scene, "--out", out, "--learn-steps", 7],
         "holds something else": ["--data", tiny_scene, "--out", tmp_path / "taken"],
-        "no such folder": ["--data", tmp_path / "none", *new],
+        "there is no folder": ["--data", tmp_path / "none", *new],
         "between 0 and 0.5": ["--data", tiny_scene, *new, "--lost-surface-mass", 0],
         "--grids has 1; a grid has 2 cells or more": ["--data", tiny_scene, *new, "--grids", 1],
     }

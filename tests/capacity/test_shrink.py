@@ -170,7 +170,7 @@ def test_bad_input_ends_with_one_line_and_status_2(
     before = ball.read_bytes()
     data, out = ["--data", tiny_scene], ["--out", tmp_path / "out.safetensors"]
     cases: dict[str, list[object]] = {
-        "there is no such folder": [ball, "--data", tmp_path / "none", *out],
+        "there is no folder": [ball, "--data", tmp_path / "none", *out],
         "raise --lost-surface-mass": [ball, *data, *out, "--lost-surface-mass", 0],
         "how its rays are marched": [tmp_path / "silent", *data, *out],
         "not nan": [ball, *data, *out, "--lost-surface-mass", "nan"],

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, TypeVar
 from PIL import ExifTags, Image
 
 from leco_plugin.log import by_number, counted
-from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.input_error import InputError, one_line, require_folder
 from leco_plugin.scenes.photograph_files import Header, check_kind, decode, header_of, is_plain
 from leco_plugin.scenes.whole_files import write_whole
 
@@ -202,8 +202,7 @@ class Found(NamedTuple):
 
 def find_photographs(folder: Path, out: Path) -> Found:
     """The photographs below a folder, but for `out`, by name. InputError for fewer than three."""
-    if not folder.is_dir():
-        raise InputError(f"there is no folder {folder}: give the one with the photographs")
+    require_folder(folder, "give the one with the photographs")
     if folder.is_relative_to(out):
         raise InputError(f"--out {out} holds the photographs: give a folder beside them")
     refused: dict[Path, str] = {}

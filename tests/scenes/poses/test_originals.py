@@ -268,6 +268,10 @@ def test_damaged_exif_is_no_reason_to_refuse(folder: Path, tmp_path: Path) -> No
 def test_a_folder_of_raw_files_says_what_to_do(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="there is no folder"):
         find_photographs(tmp_path / "nowhere", tmp_path / "out")
+    (photograph := tmp_path / "IMG_0.jpg").touch()
+    with pytest.raises(InputError, match=r"IMG_0\.jpg is a file, not a folder: give the one with"):
+        find_photographs(photograph, tmp_path / "out")
+    photograph.unlink()
     with pytest.raises(InputError, match=r"no photographs, .*give the folder .*\.jpg"):
         find_photographs(tmp_path, tmp_path / "out")
     (tmp_path / "DJI_0001.MP4").write_bytes(b"film")
