@@ -34,6 +34,8 @@ FRAMES = ("frames", "test_frames")
 """Lists of frames; the second is ScanNet++'s."""
 NO_SCENE = (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
 """What a JSON file that is no scene raises."""
+MAKE_ANEW = "make it anew from the photographs, with leco poses or ns-process-data"
+"""What to do about a transforms.json that is no scene."""
 
 
 @dataclass(frozen=True)
@@ -114,11 +116,11 @@ def read_scene_file(path: Path, split: str, folder: Path) -> SceneFile:
         poses = poses_in(frames)
     except NO_SCENE as error:
         reason = f"{type(error).__name__}: {one_line(error, 120)}"
-        fault = f"is not a scene in nerfstudio's format ({reason}); mend it, or"
-        raise InputError(f"{path} {fault} make it anew with ns-process-data") from None
+        fault = f"is not a scene in nerfstudio's format ({reason})"
+        raise InputError(f"{path} {fault}; mend it, or {MAKE_ANEW}") from None
     if len(frames) == 0:
         fault = "has no cameras: its list of frames is empty"
-        raise InputError(f"{path} {fault}; make it anew with ns-process-data")
+        raise InputError(f"{path} {fault}; {MAKE_ANEW}")
     check_poses(poses, [f"{path}: the transform_matrix of {name}" for name in names])
     if split == "train" and np.ptp(poses[:, :3, 3], axis=0).max() == 0.0:
         number = "one image" if len(frames) == 1 else f"{len(frames)} images from one place"

@@ -85,7 +85,7 @@ BAD_MEASURES: dict[str, tuple[Callable[[Path], object], str]] = {
     "no transforms.json": (lambda s: (s / "transforms.json").unlink(), "holds no transforms.json"),
     "transforms.json is no json": (
         lambda s: (s / "transforms.json").write_text("{\n\n"),
-        "not a scene in nerfstudio's format",
+        "not a scene in nerfstudio's format.*mend it, or make it anew .* with leco poses",
     ),
     "transforms.json is no mapping": (
         lambda s: (s / "transforms.json").write_text("[]"),
@@ -95,7 +95,7 @@ BAD_MEASURES: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda s: (s / "transforms.json").write_bytes(b"\xff\xfe\x00"),
         "not a scene in nerfstudio's format",
     ),
-    "zero frames": (lambda s: change(s, lambda m: m.update(frames=[])), "has no cameras"),
+    "zero frames": (lambda s: change(s, lambda m: m.update(frames=[])), "no cameras.*leco poses"),
     "no frames": (lambda s: change(s, lambda m: m.pop("frames")), "not a scene in nerf"),
     "a frame without a pose": (
         lambda s: change(s, lambda m: m["frames"][0].pop("transform_matrix")),
