@@ -160,6 +160,7 @@ def swap(
     options: Mapping[str, int | float] = MappingProxyType({}),
     codes: Literal["small", "own"] = "small",
     other_scene: bool = False,
+    learn_seconds: float | None = None,
     json: Path | None = None,
 ) -> None:
     """Train any registered nerfstudio method with its sampler swapped for a learned occupancy.
@@ -176,6 +177,8 @@ def swap(
         codes: Of the host, for the light of each photograph. small: they begin at zero and are
             scaled by 0.1. own: as the method has them, which can cost test views several dB.
         other_scene: Train also where the occupancy is of another scene, as far as its cameras say.
+        learn_seconds: Time, about, that learning an occupancy may take; it comes before the
+            method's own steps. By default as many steps as leco-occupancy learns for.
         json: File for the folder of the run, as JSON.
     """
     from nerfstudio.scripts.train import main as train
@@ -183,7 +186,9 @@ def swap(
     from leco_plugin.swap import swapped_config
 
     check_place("--json", json)
-    config = swapped_config(method, occupancy, arguments, sampler, options, codes, other_scene)
+    config = swapped_config(
+        method, occupancy, arguments, sampler, options, codes, other_scene, learn_seconds
+    )
     train(config)
     folder = config.get_base_dir()
     print(f"{method}, guided: {folder}")

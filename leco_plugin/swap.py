@@ -38,21 +38,24 @@ def swapped_config(
     options: Mapping[str, int | float] = NO_OPTIONS,
     codes: Codes = "small",
     other_scene: bool = False,
+    learn_seconds: float | None = None,
 ) -> TrainerConfig:
     """The config of a registered method with its sampler swapped.
 
     `ns-train` would be given `method` and `arguments`. `file` is an occupancy, or the folder of a
     run that left one; None learns one first, for a sampler that asks one. `sampler` is a name in
     the registry of samplers, `options` are its own. `codes` is as of `GuidedModelConfig`,
-    `other_scene` as of `OccupancyConfig`.
+    `other_scene` as of `OccupancyConfig`, whose `seconds` are `learn_seconds`.
 
     Raises:
-        InputError: there is no such method, or it is guided or learns occupancy itself; there is no
-            such sampler, or it asks another kind of gate, or has no such option; there is no such
-            file, or it is no occupancy; the arguments name a config that would replace this one,
-            or no scene.
+        InputError: an occupancy is given, and seconds for learning one; there is no such method,
+            or it is guided or learns occupancy itself; there is no such sampler, or it asks another
+            kind of gate, or has no such option; there is no such file, or it is no occupancy; the
+            arguments name a config that would replace this one, or no scene.
         SystemExit: the arguments are none of the method's; tyro has said why.
     """
+    if file is not None and learn_seconds is not None:
+        raise InputError("--occupancy gives what --learn-seconds would learn: leave one out")
     check_sampler(file, sampler, options)
     config = tyro.cli(
         tyro.conf.SuppressFixed[tyro.conf.FlagConversionOff[TrainerConfig]],
@@ -67,7 +70,9 @@ def swapped_config(
         )
     if config.data is not None and not config.data.exists():
         raise InputError(f"there is no scene {config.data} (--data)")
-    return with_sampler_swapped(config, file, sampler, options, codes, other_scene)
+    made = with_sampler_swapped(config, file, sampler, options, codes, other_scene)
+    made.pipeline.model.occupancy.seconds = learn_seconds  # type: ignore[attr-defined]
+    return made
 
 
 def check_sampler(file: Path | None, sampler: str, options: Mapping[str, int | float]) -> None:

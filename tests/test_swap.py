@@ -74,6 +74,8 @@ def test_without_a_file_one_is_learned_first_in_the_sizes_of_this_device() -> No
     assert guided.host == registered("instant-ngp").pipeline.model  # type: ignore[attr-defined]
     ngp: Any = registered("leco-ngp")
     assert guided.occupancy == ngp.pipeline.model.occupancy
+    soon: Any = swapped_config("instant-ngp", None, learn_seconds=9.0)
+    assert soon.pipeline.model.occupancy == replace(learned_first(), seconds=9.0)
 
 
 def test_a_sampler_that_asks_no_occupancy_is_given_none() -> None:
@@ -106,7 +108,7 @@ def test_a_relative_file_is_stored_as_an_absolute_one(
 
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
-    "an unknown method": ({"method": "nerfato"}, "no method 'nerfato'; there are"),
+    "an unknown method": ({"method": "nerfato"}, "no method 'nerfato'; did you mean nerfacto"),
     "a method without its package": ({"method": "kplanes"}, "not installed"),
     "a guided method": (
         {"method": "leco-ngp"},
@@ -127,6 +129,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         {"arguments": ["--load-config", "config.yml"]},
         "--load-config would train what that file says",
     ),
+    "seconds for what is given": ({"learn_seconds": 9.0}, "leave one out"),
     "a file that is not there": ({"file": Path("none.safetensors")}, "there is no occupancy"),
 }
 
