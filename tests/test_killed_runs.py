@@ -220,6 +220,7 @@ def test_ctrl_c_ends_a_run_after_its_step_and_says_how_to_go_on(runs: Runs) -> N
     assert last_line.startswith("step 7: stopped by Ctrl-C; the last good checkpoint is")
     assert last_line.endswith(
         f"the same command with --load-dir {folder} --max-num-iterations {STEPS - 8} goes on"
+        ", in place of its own --max-num-iterations"
     )
     assert "Traceback" not in said and "stopping after this step" in said
     checkpoint = newest(runs.folder("run"))

@@ -95,7 +95,13 @@ def test_ctrl_c_asks_for_the_steps_that_are_left(
     trainer.checkpoint_dir = tmp_path
     trainer.asked_to_stop = SimpleNamespace(is_set=lambda: True)
     (tmp_path / "step-000000049.ckpt").touch()
-    with pytest.raises(TrainingStopped, match=f"iterations {90 if from_zero else 40} goes on"):
+    monkeypatch.setattr("sys.argv", ["ns-train", "leco-occupancy"])
+    with pytest.raises(TrainingStopped, match=f"iterations {90 if from_zero else 40} goes on$"):
+        trainer.stop_if_asked(49)
+    again = ["--load-dir", "before", "--max_num_iterations=60"]
+    monkeypatch.setattr("sys.argv", ["ns-train", "leco-occupancy", *again])
+    own = "goes on, in place of its own --load-dir and --max-num-iterations$"
+    with pytest.raises(TrainingStopped, match=own):
         trainer.stop_if_asked(49)
     (tmp_path / "step-000000089.ckpt").touch()
     with pytest.raises(TrainingStopped) as stopped:
