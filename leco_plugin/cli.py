@@ -12,7 +12,8 @@ import shlex
 import sys
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from inspect import signature
 from pathlib import Path
@@ -247,9 +248,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(SEPARATE, file=sys.stderr)
         sys.exit(BAD_INPUT)
     try:
-        with warnings.catch_warnings():
-            # what nerfstudio and torch think of each other is nothing that a user can act on
-            warnings.filterwarnings("ignore", module=r"nerfstudio|torch")
+        with _plain_warnings():
             tyro.extras.subcommand_cli_from_dict(
                 COMMANDS, prog="leco", description=about, args=given
             )
@@ -273,6 +272,20 @@ def _is_meant_for_training(words: Sequence[str]) -> bool:
     before = words[: words.index("--")] if "--" in words else words
     named = [word.partition("=")[0].replace("_", "-") for word in before if word[:2] == "--"]
     return any(not is_like(option, own) for option in named)
+
+
+@contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """While it lasts, a warning is one line, without its place in the code."""
+    before = warnings.formatwarning
+    warnings.formatwarning = lambda message, *_, **__: f"leco: {' '.join(str(message).split())}\n"
+    try:
+        with warnings.catch_warnings():
+            # what nerfstudio and torch think of each other is nothing that a user can act on
+            warnings.filterwarnings("ignore", module=r"nerfstudio|torch")
+            yield
+    finally:
+        warnings.formatwarning = before
 
 
 def _complain(error: BaseException, status: int) -> int:

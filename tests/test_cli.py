@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -397,3 +398,18 @@ def test_a_failure_ends_with_one_line_and_status_1(
     monkeypatch.setitem(cli.COMMANDS, "fail", fail)
     assert run("fail") == 1
     assert capsys.readouterr().err == "leco: the gate calls all space empty\n"
+
+
+def test_a_warning_is_one_line_without_its_place_in_the_code(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def warn() -> None:
+        """Warns, as is shown where no test records it."""
+        said = UserWarning("LPIPS is left out:\nits weights are not here")
+        print(warnings.formatwarning(said, UserWarning, "metrics.py", 121), end="")
+
+    before = warnings.formatwarning
+    monkeypatch.setitem(cli.COMMANDS, "warn", warn)
+    assert run("warn") == 0
+    assert capsys.readouterr().out == "leco: LPIPS is left out: its weights are not here\n"
+    assert warnings.formatwarning is before
