@@ -24,7 +24,8 @@ import tyro
 
 from leco_plugin.cli_experiments import capacity, chart, check, stability
 from leco_plugin.cli_occupancy import export, inspect, shrink
-from leco_plugin.scenes.input_error import is_like, one_line, unknown_name
+from leco_plugin.names import is_like, unknown_name
+from leco_plugin.scenes.input_error import one_line
 from leco_plugin.scenes.whole_files import check_place, write_report
 
 BAD_INPUT, FAILURE = 2, 1

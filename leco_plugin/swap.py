@@ -18,8 +18,9 @@ from leco_plugin.hosts.guided import Codes, GuidedModelConfig
 from leco_plugin.hosts.guided_start import OccupancyConfig, load_occupancy, occupancy_file
 from leco_plugin.method_configs import LEARNING, ON_GPU, best_device
 from leco_plugin.models.sizing.sizes import learning_only
+from leco_plugin.names import unknown_name
 from leco_plugin.samplers.registry import check_gate, refuse_unknown_options
-from leco_plugin.scenes.input_error import InputError, unknown_name
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.reading import with_checks
 from leco_plugin.studio.dynamic_batch import clamped
 from leco_plugin.studio.processes import DataParallelTrainerConfig

@@ -28,8 +28,9 @@ from leco_plugin.hosts.guided_start import OWN_SAMPLER
 from leco_plugin.method_configs import LEARNING, ON_GPU
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.switch.field import SwitchNerfModelConfig
+from leco_plugin.names import unknown_name
 from leco_plugin.samplers.registry import samplers as registered_samplers
-from leco_plugin.scenes.input_error import InputError, unknown_name
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.swap import registered
 
 SIZED_GRID = re.compile(rf"{GRID}-(\d+)")

@@ -15,8 +15,9 @@ from leco_plugin.conformance.proposals import ProposalCase
 from leco_plugin.conformance.rules import RULES, Case, Rule, Verdict, apply, left_as_before
 from leco_plugin.conformance.samplers import SamplerCase
 from leco_plugin.conformance.scene import SLAB
+from leco_plugin.names import unknown_name
 from leco_plugin.samplers.registry import sampler_spec, samplers, why_left_out
-from leco_plugin.scenes.input_error import InputError, unknown_name
+from leco_plugin.scenes.input_error import InputError
 
 
 def sampler_cases(name: str) -> list[Case]:

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 from torch import nn
 
-from leco_plugin.scenes.input_error import known_names, unknown_name
+from leco_plugin.names import known_names, unknown_name
 
 Kind = TypeVar("Kind")
 

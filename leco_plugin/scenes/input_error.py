@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from difflib import get_close_matches
 from pathlib import Path
 
 
@@ -22,8 +21,6 @@ ANOTHER_VERSION = (
     "is of another version of leco_plugin: train again, or install the version that made it"
 )
 """After what is a run's file."""
-LIKE = 0.7
-"""Likeness, 0 to 1, from which on an unknown name is taken for a misspelt one."""
 
 
 @contextmanager
@@ -45,24 +42,6 @@ def require(holds: bool, option: str, value: object, wanted: str) -> None:
     """InputError unless the value of an option (named without dashes) is as `wanted`."""
     if not holds:
         raise InputError(f"{option} is {value}; it must be {wanted}")
-
-
-def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:
-    """What is said where there is nothing of a name."""
-    return f"there is no {kind} {name!r}; {known_names(name, known)}"
-
-
-def known_names(name: str, known: Iterable[str]) -> str:
-    """What to say after an unknown name: the known one that it resembles, and all of them."""
-    names = {each.lower(): each for each in known}
-    near = get_close_matches(name.lower(), names, 1, LIKE)
-    meant = f"did you mean {names[near[0]]}? There are" if near else "there are"
-    return f"{meant} {', '.join(names.values()) or 'none'}"
-
-
-def is_like(name: str, known: Iterable[str]) -> bool:
-    """Whether a name is a known one, or resembles one."""
-    return bool(get_close_matches(name, list(known), 1, LIKE))
 
 
 def require_folder(path: Path, remedy: str) -> None:

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from leco_plugin.scenes.input_error import InputError, unknown_name
+from leco_plugin.names import unknown_name
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.stability.photographs import STAGES, Capture
 from leco_plugin.stability.plan import DENSE, GRID, GRIDS, LEARNED, RAYS
 

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from leco_plugin.chart.contender import Contender, Job
 from leco_plugin.hosts.guided_start import OWN_SAMPLER
-from leco_plugin.scenes.input_error import InputError, unknown_name
+from leco_plugin.names import unknown_name
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.stability.photographs import STAGES, YARD, Capture
 from leco_plugin.stability.scene import Stage
 

@@ -1,0 +1,14 @@
+"""Claims about what is said of an unknown name."""
+
+from __future__ import annotations
+
+from leco_plugin.names import unknown_name
+
+
+def test_an_unknown_name_is_answered_with_a_known_one_only_where_it_resembles_one() -> None:
+    known = ["nerfacto", "BioNeRF"]
+    assert unknown_name("method", "bionerv", known) == (
+        "there is no method 'bionerv'; did you mean BioNeRF? There are nerfacto, BioNeRF"
+    )
+    assert unknown_name("case", "x", known) == "there is no case 'x'; there are nerfacto, BioNeRF"
+    assert unknown_name("case", "x", []) == "there is no case 'x'; there are none"
