@@ -32,7 +32,7 @@ NEAREST = 3
 """Points whose colours are averaged."""
 GREY = 128
 COLOURS = "points3D_rgb"
-"""That of their colours, uint8 [P, 3]. nerfstudio's pipelines want both or neither."""
+"""Key of their colours, uint8 [P, 3], beside `POINTS`. nerfstudio wants both or neither."""
 
 
 class ColouredPoints(NamedTuple):
@@ -239,12 +239,8 @@ def told_by(scene: SceneFile, data: Path, outputs: Any) -> dict[str, Any]:
         frame = from_file(parsed_frame(outputs), applied, applied_scale, torch.float64)
     except (ValueError, TypeError, RuntimeError) as error:
         raise InputError(f"{data} cannot be read: {one_line(error, 120)}") from None
-    told: dict[str, Any] = {}
-    if (
-        POINTS not in outputs.metadata
-        and (points := read_points(meta, scene.path.parent)) is not None
-    ):
-        told |= points_in_model(points, frame)
+    points = None if POINTS in outputs.metadata else read_points(meta, scene.path.parent)
+    told: dict[str, Any] = {} if points is None else points_in_model(points, frame)
     if "metres_per_unit" in meta:
         metres = meta["metres_per_unit"]
         if type(metres) not in (int, float) or not 0.0 < metres < float("inf"):
