@@ -224,7 +224,7 @@ def leco_ngp_with(occupancy: OccupancyConfig, scene: Path) -> Any:
 
 
 def test_an_unknown_sampler_is_refused_in_a_line(tiny_scene: Path) -> None:
-    with pytest.raises(InputError, match="no sampler 'lerned-occupancy'; there are dense"):
+    with pytest.raises(InputError, match="no sampler 'lerned-occupancy'; did you mean learned"):
         leco_ngp_with(OccupancyConfig(sampler="lerned-occupancy"), tiny_scene)
 
 

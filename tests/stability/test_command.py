@@ -80,7 +80,7 @@ def test_a_second_process_in_the_same_folder_is_refused_in_one_line(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--cases", "foog"), "no case 'foog'; there are yard, poles-and-wires"),
+        (("--cases", "foog"), "no case 'foog'; did you mean fog? There are yard, poles"),
         (("--samplers", "grid"), "no sampler 'grid'; there are learned, grid-128"),
     ],
 )
