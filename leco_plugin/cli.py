@@ -237,7 +237,8 @@ COMMANDS: dict[str, Callable[..., None]] = {command.__name__: command for comman
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs `leco`: 0, or one line on stderr and 2 for bad input, 1 for a failure."""
+    """Runs `leco`: 0, or one line on stderr and 2 for bad input, 1 for a failure. A command line
+    that says nothing which could be run is a SystemExit of 2, as tyro has it."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     about = "Learned occupancy for nerfstudio: what is empty is skipped."
     atexit.register(gc.freeze)  # else a command searches all that it imported for cycles: seconds
