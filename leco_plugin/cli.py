@@ -24,7 +24,7 @@ import tyro
 
 from leco_plugin.cli_experiments import capacity, chart, check, stability
 from leco_plugin.cli_occupancy import export, inspect, shrink
-from leco_plugin.names import is_like, unknown_name
+from leco_plugin.names import is_like, options_in, unknown_name
 from leco_plugin.scenes.input_error import one_line
 from leco_plugin.scenes.whole_files import check_place, write_report
 
@@ -272,8 +272,7 @@ def _is_meant_for_training(words: Sequence[str]) -> bool:
         option = name.replace("_", "-")
         own += [f"--{option}", f"--no-{option}"]
     before = words[: words.index("--")] if "--" in words else words
-    named = [word.partition("=")[0].replace("_", "-") for word in before if word[:2] == "--"]
-    return any(not is_like(option, own) for option in named)
+    return any(not is_like(option, own) for option in options_in(before))
 
 
 @contextmanager

@@ -1,12 +1,18 @@
-"""Names that a user gives: what is said of an unknown one."""
+"""Names that a user gives: of options, and what is said of an unknown one."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 
 LIKE = 0.7
 """Likeness, 0 to 1, from which on an unknown name is taken for a misspelt one."""
+
+
+def options_in(words: Sequence[str]) -> list[str]:
+    """Names of the options among words that were typed, with their dashes, as help has them."""
+    named = [word.partition("=")[0] for word in words if word.startswith("--")]
+    return [name.replace("_", "-") for name in named if name != "--"]
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:

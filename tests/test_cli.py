@@ -25,6 +25,14 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working directory: a folder with a file that is no occupancy."""
+    monkeypatch.chdir(tmp_path)
+    Path("text.safetensors").write_text("not an occupancy")
+    return tmp_path
+
+
 def run(*arguments: object) -> int:
     return cli.main([str(argument) for argument in arguments])
 
@@ -259,21 +267,15 @@ def test_bad_input_ends_with_one_line_and_status_2(
     ],
 )
 def test_a_place_that_cannot_be_written_to_is_named_before_anything_is_read_or_written(
-    option: str,
-    command: list[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    option: str, command: list[str], here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("text.safetensors").write_text("not an occupancy")
     Path("taken.png").mkdir()
     assert run(*command, option, Path("taken.png")) == 2
     assert run(*command, option, Path("text.safetensors", "report.png")) == 2
     folder, below_a_file = capsys.readouterr().err.splitlines()
     assert folder == f"leco: {option} taken.png is a folder; give a file"
     assert below_a_file.startswith(f"leco: {option} ") and below_a_file.endswith("not a folder")
-    assert {path.name for path in tmp_path.iterdir()} == {"text.safetensors", "taken.png"}
+    assert {path.name for path in here.iterdir()} == {"text.safetensors", "taken.png"}
 
 
 @pytest.mark.parametrize(
@@ -290,15 +292,8 @@ def test_a_place_that_cannot_be_written_to_is_named_before_anything_is_read_or_w
     ],
 )
 def test_a_place_that_takes_no_new_file_is_named_before_the_work(
-    option: str,
-    name: str,
-    command: list[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    option: str, name: str, command: list[str], here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("text.safetensors").write_text("not an occupancy")
     assert run(*command, option, Path("/proc", name)) == 2  # which root may write to, by its rights
     said = capsys.readouterr()
     assert said.err.startswith("leco: nothing can be written into /proc"), said.err

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from leco_plugin.evaluation.clock import Budget
 from leco_plugin.hosts.guided_start import OWN_SAMPLER
 from leco_plugin.log import counted
+from leco_plugin.names import unknown_name
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import HeldOut
 
@@ -90,7 +91,7 @@ def changed(config: Any, path: str, value: Any) -> Any:
     name, _, rest = path.partition(".")
     if isinstance(config, dict):
         if name not in config:
-            raise ValueError(f"there is no setting {name!r}; there are {', '.join(config)}")
+            raise ValueError(unknown_name("setting", name, config))
         return {**config, name: changed(config[name], rest, value) if rest else value}
     if name not in getattr(config, "__dataclass_fields__", {}):
         raise ValueError(f"{type(config).__name__} has no setting {name!r}")

@@ -11,7 +11,6 @@ import functools
 import inspect
 import os
 import re
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -159,9 +158,6 @@ COUNTED_FROM_ZERO = re.compile(
 )
 """In the source of `Trainer.train` where a resumed run ends after `max_num_iterations` in all."""
 
-RESUME_OPTIONS = "--load-dir", "--max-num-iterations"
-"""What a command is given to go on with its run."""
-
 
 @functools.cache
 def counts_from_zero() -> bool:
@@ -181,12 +177,6 @@ def end_of(trainer: Any) -> int:
 def iterations_until(end: int, done: int) -> int:
     """The `--max-num-iterations` with which a run goes on after `done` steps and ends at `end`."""
     return end if counts_from_zero() else end - done
-
-
-def is_typed(option: str) -> bool:
-    """Whether the command line has an option, given with its dashes."""
-    words = [word.partition("=")[0].replace("_", "-") for word in sys.argv[1:]]
-    return option in words
 
 
 def keeps_all_images(config: Any, photographs: int) -> bool:

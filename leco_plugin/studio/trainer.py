@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -22,16 +23,15 @@ from leco_plugin.learning.collapse import GateCollapsed
 from leco_plugin.learning.run import Progress
 from leco_plugin.log import counted, say, say_what_is_logged
 from leco_plugin.models.compute.ranks import is_first
+from leco_plugin.names import options_in
 from leco_plugin.samplers.kernels import VARIABLE, kernels_off
 from leco_plugin.scenes.input_error import InputError, TrainingStopped
 from leco_plugin.studio.checkpoints import first_not_finite, previous_of, step_of, whole_of
 from leco_plugin.studio.run_folder import (
-    RESUME_OPTIONS,
     check_photographs,
     checkpoint_of,
     drop_missing_parameters,
     end_of,
-    is_typed,
     iterations_until,
     keep_sizes,
     with_sizes_of,
@@ -175,8 +175,8 @@ class AtomicTrainer(Trainer):
             done, end = step_of(saved[-1]) + 1, end_of(self)
             steps = f"--max-num-iterations {iterations_until(end, done)}"
             resume = f"the same command with --load-dir {self.checkpoint_dir} {steps} goes on"
-            own = " and ".join(option for option in RESUME_OPTIONS if is_typed(option))
-            resume += f", in place of its own {own}" if own else ""
+            typed = {"--load-dir", "--max-num-iterations"}.intersection(options_in(sys.argv))
+            resume += f", in place of its own {' and '.join(sorted(typed))}" if typed else ""
             parts += [resume] if done < end else []
         raise TrainingStopped("; ".join(parts))
 
