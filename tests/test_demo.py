@@ -93,4 +93,7 @@ def test_the_demo_reports_both_runs_in_the_agreed_form(
     for name in ("chart.png", "picture.png"):
         assert np.asarray(Image.open(tmp_path / name)).std() > 10
     assert any("leco-occupancy-never-frozen" in line for line in summary(report))
+    assert "mean nothing" in summary(report)[-2]
+    report["scene"]["blocks"] = 3
+    assert "mean nothing" not in "".join(summary(report))
     assert summary(report)[-1] == f"all of it took {report['seconds_in_all'] / 60:.1f} minutes"

@@ -87,12 +87,15 @@ def write_points(path: Path, rows: NDArray[Any], comments: Sequence[str] = ()) -
 
 
 def check_place(option: str, path: Path | None) -> None:
-    """InputError if a file cannot be written there: it is a folder, or one of its folders is a file
-    or takes no new file. Tries it with a file that has no name, as rights do not say all."""
+    """InputError if a file cannot be written there: it is a folder or a device, or one of its
+    folders is a file or takes no new file. Tries it with a file that has no name, as rights do not
+    say all."""
     if path is None:
         return
-    if path.is_dir():
-        raise InputError(f"{option} {path} is a folder; give a file")
+    is_device = path.parent == Path("/dev")  # a file would take its place
+    if is_device or (path.exists() and not path.is_file()):
+        kind = "a folder" if path.is_dir() else "a device or a pipe"
+        raise InputError(f"{option} {path} is {kind}; give a file")
     nearest = next(folder for folder in path.absolute().parents if folder.exists())
     if not nearest.is_dir():
         raise InputError(f"{option} {path}: {nearest} is a file, not a folder")

@@ -1,5 +1,6 @@
 """A file under its name is whole, whatever happens to the process that writes it."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
@@ -10,7 +11,7 @@ from scene_files import refused
 from leco_plugin.scenes.coloured_points import read_cloud
 from leco_plugin.scenes.photograph_files import header_of
 from leco_plugin.scenes.pt_file import read_pt
-from leco_plugin.scenes.whole_files import PART, remove_parts, write_whole
+from leco_plugin.scenes.whole_files import PART, check_place, remove_parts, write_whole
 
 
 def test_a_file_replaces_the_old_one_and_makes_its_folder(tmp_path: Path) -> None:
@@ -38,6 +39,13 @@ def test_a_failure_leaves_the_old_file_and_no_part(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         write_whole(path, fail)
     assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("file", b"old")]
+
+
+def test_a_report_takes_the_place_of_no_device_and_no_pipe(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path in (Path("/dev/stdout"), tmp_path / "pipe"):
+        with refused(f"^--json {path} is a device or a pipe; give a file$"):
+            check_place("--json", path)
 
 
 def test_parts_of_killed_processes_are_found_at_any_depth(tmp_path: Path) -> None:
