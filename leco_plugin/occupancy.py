@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
@@ -19,6 +18,7 @@ from torch import Tensor, nn
 from leco_plugin.models.frozen_gate import occupancy_of
 from leco_plugin.models.gate import Gate, GateConfig, check_sizes
 from leco_plugin.samplers.kernels import fused
+from leco_plugin.scenes.whole_files import write_whole
 from leco_plugin.seen import SeenSpace, cells_from_bytes
 from leco_plugin.space import NO_WALL, Space
 
@@ -197,15 +197,13 @@ class Occupancy(nn.Module):
         if not self.seen.everywhere:
             tensors[SEEN] = self.seen.to_bytes()
         header["sha256"] = _digest(header, tensors)
-        unfinished = path.with_name(f".{path.name}.{os.getpid()}.unfinished")
-        try:
-            from safetensors.torch import save  # a gate in memory needs torch only
+        if not path.parent.is_dir():
+            raise FileNotFoundError(f"there is no folder {path.parent} to save {path.name} in")
+        from safetensors.torch import save  # a gate in memory needs torch only
 
-            # not save_file: that leaves a file which only its owner can read
-            unfinished.write_bytes(save(tensors, metadata=header))
-            unfinished.replace(path)
-        finally:
-            unfinished.unlink(missing_ok=True)
+        # not save_file: that leaves a file which only its owner can read
+        content = save(tensors, metadata=header)
+        write_whole(path, lambda file: file.write(content))
 
     @classmethod
     def load(cls, path: str | Path, device: str | torch.device = "cpu") -> Occupancy:

@@ -3,15 +3,19 @@
 import os
 from collections.abc import Callable
 from pathlib import Path
+from threading import Thread
 from typing import BinaryIO
 
 import pytest
 from scene_files import refused
 
+from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.coloured_points import read_cloud
 from leco_plugin.scenes.photograph_files import header_of
 from leco_plugin.scenes.pt_file import read_pt
 from leco_plugin.scenes.whole_files import PART, check_place, remove_parts, write_whole
+from leco_plugin.space import Space
 
 
 def test_a_file_replaces_the_old_one_and_makes_its_folder(tmp_path: Path) -> None:
@@ -64,3 +68,22 @@ def test_what_git_lfs_has_not_fetched_is_named(
     path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
     with refused(r"0\.jpg .*is a pointer of Git LFS: `git lfs pull` fetches the file$"):
         read(path)
+
+
+def test_two_threads_may_save_one_occupancy_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    occupancy, path = Occupancy(Gate(GateConfig()), Space(), 0.5), tmp_path / "o.safetensors"
+    replace = Path.replace
+
+    def after_another_thread(part: Path, whole: Path) -> Path:
+        monkeypatch.undo()
+        other = Thread(target=occupancy.save, args=(path,))
+        other.start()
+        other.join()
+        return replace(part, whole)
+
+    monkeypatch.setattr(Path, "replace", after_another_thread)
+    occupancy.save(path)
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+    assert Occupancy.load(path).threshold == 0.5
