@@ -169,12 +169,16 @@ class ColorHead(nn.Module):
         """Whether `networks.c` gives the colours of rays, and `gradients.c` what they teach."""
         widest = max(features.shape[-1], self.out.in_features)
         known = widest <= native.WIDEST
-        return known and native.suits_networks(features, weights, self.out.weight)
+        return known and native.suits_networks([features, weights], self.layer_parts())
+
+    def layer_parts(self) -> list[Tensor]:
+        """Weights and biases of both layers."""
+        return [*self.of_features.parameters(), *self.out.parameters()]
 
     def native_parts(self) -> list[Tensor]:
-        """Weights and biases of both layers, the last one's for red, green and blue."""
-        out = self.out.weight, self.out.bias
-        return [*self.of_features.parameters(), *(self.opponent.T @ each for each in out)]
+        """The same, the last layer's for red, green and blue."""
+        *hidden, weight, bias = self.layer_parts()
+        return [*hidden, self.opponent.T @ weight, self.opponent.T @ bias]
 
 
 @dataclass(frozen=True)
@@ -234,8 +238,7 @@ class HMoEField(nn.Module):
             sigmas [N] float32, per half extent of the scene; features [N, width].
         """
         parts = self.native_parts() if self.suits_native() else []
-        asked = mapped, gate_values, *(part for part in parts if part is not None)
-        if parts and native.suits_networks(*asked):
+        if parts and native.suits_networks([mapped, gate_values], parts):
             features, layers = self.encoding(mapped), self.config.experts.layers
             given = features, routes, gate_values, layers, *parts
             hidden, raw = FieldDensities.apply(*given)

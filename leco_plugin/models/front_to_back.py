@@ -8,6 +8,8 @@ is one routine in C, `compute/front_to_back.c`, where that knows gate and field.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor
@@ -38,8 +40,17 @@ FEWEST_AT_ONCE, MOST_LOOKS = 8, 16
 AT_ONCE_IN_C = 4
 """The same samples in C, where a look costs less."""
 
-in_float32 = torch.autocast("cpu", enabled=False)
-"""What C computes in, whatever torch's products have: it is faster than torch in bfloat16."""
+
+@contextmanager
+def in_float32() -> Iterator[None]:
+    """What C computes in, whatever torch's products have: it is faster than torch in bfloat16.
+
+    Each call has an `autocast` of its own. It restores what it found, so that one which threads
+    share would leave each thread in the precision of another.
+    """
+    with torch.autocast("cpu", enabled=False):
+        yield
+
 
 MANY_RAYS = 2048
 """In a batch from which on a CPU torch is no slower for looking; see `docs/decisions.md`."""
@@ -112,7 +123,7 @@ def samples_of(starts: Tensor, counts: Tensor, most: int) -> Tensor:
     return (starts[:, None] + steps)[steps < counts[:, None]]
 
 
-@in_float32
+@in_float32()
 def suits_native(scene: Scene, rays: Rays, intervals: Intervals) -> bool:
     """Whether `front_to_back.c` serves."""
     field, gate, _, routing = scene
@@ -124,10 +135,14 @@ def suits_native(scene: Scene, rays: Rays, intervals: Intervals) -> bool:
         and field.suits_native()
         and not (torch.is_grad_enabled() and gate.head.weight.requires_grad)
     )
-    return known and gate.suits_native(rays.origins) and native.suits(*rays[:4], *intervals[1:])
+    if not (known and gate.suits_native(rays.origins)):
+        return False
+    assert isinstance(field.encoding, HashEncoding)
+    parts = field.encoding.table, *field.native_parts(), *field.color.layer_parts()
+    return native.suits_networks([*rays[:4], *intervals[1:]], parts)
 
 
-@in_float32
+@in_float32()
 @torch.no_grad()
 def shade_natively(scene: Scene, rays: Rays, intervals: Intervals) -> tuple[Shaded, Intervals]:
     """`shade_front_to_back` in C; `evaluation/queries.py` counts what it asks."""

@@ -142,7 +142,7 @@ class Gate(nn.Module):
         widest = max(self.encoding.out_dim, self.config.width, 1 + self.config.scene_experts)
         known = isinstance(self.encoding, FrequencyEncoding) and widest <= native.WIDEST
         without = not (torch.is_grad_enabled() and mapped.requires_grad)
-        return known and without and native.suits_networks(mapped, self.head.weight)
+        return known and without and native.suits_networks([mapped], self.native_parts())
 
     def native_parts(self) -> list[Tensor]:
         """Weights and biases as `networks.c` takes them."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from threading import Thread
 from typing import Literal
 
 import pytest
@@ -192,3 +193,24 @@ def test_where_torch_was_not_measured_to_be_no_slower_it_shades_everything() -> 
     assert not is_no_slower(MANY_RAYS - 1, True, cpu)
     assert not is_no_slower(MANY_RAYS, False, cpu)
     assert not is_no_slower(MANY_RAYS, True, torch.device("cuda"))
+
+
+def test_another_thread_leaves_a_threads_precision_as_it_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rays = some_rays(9)
+    given = scene_of(1.0), rays, kept_along(rays)
+    suits = native.suits
+
+    def after_another_thread(*tensors: torch.Tensor) -> bool:
+        monkeypatch.undo()
+        other = Thread(target=suits_native, args=given)
+        other.start()
+        other.join()
+        return suits(*tensors)
+
+    monkeypatch.setattr(native, "suits", after_another_thread)
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        suits_native(*given)
+        assert native.suits is suits
+        assert torch.is_autocast_enabled("cpu")

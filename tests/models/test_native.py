@@ -11,10 +11,13 @@ from torch import Tensor
 from leco_plugin.models.compute import native
 from leco_plugin.models.encodings import EncodingConfig, HashEncoding
 from leco_plugin.models.field import FieldConfig, HMoEField
+from leco_plugin.models.front_to_back import shade_front_to_back
 from leco_plugin.models.frozen_gate import occupancy_of
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.hmoe import HMoEConfig
+from leco_plugin.models.rendering import Intervals, Rays, Routing, Scene, composite
 from leco_plugin.samplers.kernels import VARIABLE
+from leco_plugin.space import Space
 
 needs_compiler = pytest.mark.skipif(not native.has_native(), reason="no C compiler")
 
@@ -134,6 +137,46 @@ def test_positions_in_other_strides_are_read_as_they_are() -> None:
     encoding = HashEncoding(levels=2, features=2, log2_table=6, coarsest=4, finest=9)
     columns = torch.rand(3, 50) * 2 - 1
     assert torch.equal(encoding(columns.t()), encoding(columns.t().contiguous()))
+
+
+def turn_in_memory(module: torch.nn.Module) -> None:
+    """Leaves all weights as they are, matrices with their columns in one piece."""
+    for parameter in module.parameters():
+        if parameter.dim() == 2:
+            parameter.data = parameter.data.t().contiguous().t()
+
+
+def test_weights_in_other_strides_are_read_as_they_are() -> None:
+    torch.manual_seed(0)
+    grid = EncodingConfig("hash", levels=2, log2_table=6, coarsest=4, finest=9)
+    gate = Gate(GateConfig(width=16, layers=2, scene_experts=2))
+    field = HMoEField(FieldConfig(grid, HMoEConfig(scene_experts=2, width=9)), 3)
+    for parameter in field.parameters():
+        parameter.data.normal_(0.0, 0.3)
+    mapped, weights, rays = torch.rand(30, 3), torch.rand(30), torch.arange(30)
+    directions = torch.nn.functional.normalize(mapped, dim=-1)
+    along = Rays(mapped, directions, torch.zeros(30), torch.ones(30), None)
+    intervals = Intervals(rays, torch.zeros(30), torch.ones(30))
+    scene = Scene(field, gate, Space(), Routing(0.2, False))
+
+    def answers() -> list[Tensor]:
+        sigmas, features = field.density(mapped, rays % 3, torch.ones(30))
+        colors = composite(field.color, features, weights, along, intervals)
+        logits = gate(mapped)
+        (logits.square().sum() + sigmas.sum() + colors.sum()).backward()
+        parts = [*gate.parameters(), *field.parameters()]
+        slopes = [part.grad for part in parts if part.grad is not None]
+        shown, _ = shade_front_to_back(scene, along, intervals)
+        found = [logits, sigmas, features, colors, shown.rgb, *slopes]
+        gate.zero_grad()
+        field.zero_grad()
+        return [each.detach() for each in found]
+
+    before = answers()
+    turn_in_memory(gate)
+    turn_in_memory(field)
+    for ours, theirs in zip(answers(), before, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
 
 
 def test_without_a_compiler_torch_answers_and_the_log_says_so(

@@ -75,10 +75,12 @@ def suits(*tensors: Tensor) -> bool:
     return known and has_native()
 
 
-def suits_networks(*tensors: Tensor) -> bool:
-    """Whether networks may be asked in C, and learn: as `suits`, and nobody wants products in
-    halves."""
-    return not torch.is_autocast_enabled("cpu") and suits(*tensors)
+def suits_networks(points: Sequence[Tensor], parts: Sequence[Tensor | None]) -> bool:
+    """Whether networks of these weights and biases may be asked about points in C, and learn: as
+    `suits`, weights are contiguous, and nobody wants products in halves."""
+    known = [part for part in parts if part is not None]
+    readable = all(part.is_contiguous() for part in known)
+    return readable and not torch.is_autocast_enabled("cpu") and suits(*points, *known)
 
 
 def hash_sums(positions: Tensor, resolutions: Tensor, table: Tensor, corners: int) -> Tensor:
@@ -94,7 +96,8 @@ def hash_sums(positions: Tensor, resolutions: Tensor, table: Tensor, corners: in
     """
     levels, (rows, features) = len(resolutions), table.shape
     out = positions.new_empty(len(positions), levels * features)
-    positions, resolutions = positions.contiguous(), resolutions.float().contiguous()
+    positions, table = positions.contiguous(), table.contiguous()
+    resolutions = resolutions.float().contiguous()
     pointers = pointers_to(positions, resolutions, table, out)
     sizes = (levels, log2_of(rows // levels), features, corners)
     _of_points("hash_sums", pointers, len(positions), sizes)
