@@ -81,9 +81,10 @@ class LecoModelConfig(ModelConfig):
     distortion_after: float = 0.04
     """Share of the distortion loss that stays when the first phase is over and detail is wanted."""
     front_to_back: bool | None = None
-    """Whether rendering shades from the front and nothing behind opaque surfaces: fewer samples for
-    the same image, and more steps to get there. None: where that was measured to be no slower,
-    which is in C on a CPU and, without C, for guided batches of 2048 rays or more there."""
+    """Whether rendering shades from the front, nothing behind opaque surfaces and one of two faint
+    neighbours: fewer samples for the same image, and more steps to get there. None: where that was
+    measured to be no slower, which is in C on a CPU and, without C, for guided batches of 2048 rays
+    or more there."""
     homogeneous: bool = False
     """A mixture of scene experts only, for comparison: no empty-space expert, nothing to freeze."""
     precision: Precision | None = None

@@ -14,6 +14,7 @@ from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig, HMoEField
 from leco_plugin.models.front_to_back import (
     AT_ONCE_IN_C,
+    FAINT,
     FEWEST_AT_ONCE,
     LEAST_LIGHT,
     MANY_RAYS,
@@ -53,6 +54,11 @@ def by(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv(VARIABLE, "native")
 
 
+@pytest.fixture
+def nothing_is_faint(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(front_to_back, "FAINT", 0.0)
+
+
 def scene_of(density: float) -> Scene:
     """About so dense everywhere, per half extent."""
     torch.manual_seed(0)
@@ -82,10 +88,13 @@ def kept_along(rays: Rays) -> Intervals:
     return with_backdrop(Intervals(*samples), rays, STEP, 0.0)
 
 
-@pytest.mark.usefixtures("by")
+@pytest.mark.usefixtures("by", "nothing_is_faint")
 @pytest.mark.parametrize("density", [0.01, 1.0, 30.0, 3000.0])
 @pytest.mark.parametrize("count", [0, 1, 150])
-def test_it_renders_what_asking_about_everything_renders(count: int, density: float) -> None:
+def test_it_renders_what_asking_about_everything_renders(
+    count: int, density: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(front_to_back, "LEAST_LIGHT", 1e-4)  # less than shows anywhere
     scene, rays = scene_of(density), some_rays(count)
     everything = kept_along(rays)
     with torch.no_grad():
@@ -98,6 +107,46 @@ def test_it_renders_what_asking_about_everything_renders(count: int, density: fl
 
 
 @pytest.mark.usefixtures("by")
+@pytest.mark.parametrize("density", [0.001, 0.03, 1.0, 30.0])
+def test_of_two_neighbours_that_are_faint_one_is_enough(density: float) -> None:
+    scene, rays = scene_of(density), some_rays(150)
+    everything = kept_along(rays)
+    with torch.no_grad():
+        whole = shade(scene, rays, everything, freeze_gate=True)
+    seen, asked = shade_front_to_back(scene, rays, everything)
+    of_asked = [(int(ray), float(t)) for ray, t in zip(asked.ray_indices, asked.t_starts)]
+    expected = not_faint(everything, whole.sigmas, rays)
+    assert of_asked == [one for one in expected if one in set(of_asked)]  # in order, none beside
+    missed = expected.keys() - set(of_asked)
+    assert all(expected[one] < 1.01 * LEAST_LIGHT for one in missed)
+    if density == 0.001:
+        assert not missed and 0.5 < len(of_asked) / len(everything.t_starts) < 0.8
+    with torch.no_grad():
+        shown = shade(scene, rays, asked, freeze_gate=True)
+    torch.testing.assert_close(seen.rgb, shown.rgb, atol=1e-5, rtol=0.0)
+
+
+def not_faint(
+    samples: Intervals, sigmas: torch.Tensor, rays: Rays
+) -> dict[tuple[int, float], float]:
+    """What is to be asked, one sample after the other, and the light that is left before it."""
+    found: dict[tuple[int, float], float] = {}
+    lengths = (samples.t_ends - samples.t_starts) / 0.5
+    opacities = (-(-sigmas * lengths).expm1()).tolist()
+    starts, ends = samples.t_starts.tolist(), samples.t_ends.tolist()
+    for ray in range(len(rays.origins)):
+        numbers = (samples.ray_indices == ray).nonzero()[:, 0].tolist()
+        light = 1.0
+        for place, n in enumerate(numbers):
+            between = n - 1 in numbers and n + 1 in numbers
+            gap = max(starts[n] - ends[n - 1], starts[n + 1] - ends[n]) if between else STEP
+            if place % 2 or gap > STEP / 2 or max(opacities[n - 1 : n + 2 : 2]) >= FAINT:
+                found[ray, starts[n]] = light
+                light *= 1.0 - opacities[n]
+    return found
+
+
+@pytest.mark.usefixtures("by", "nothing_is_faint")
 @pytest.mark.parametrize("density", [0.01, 30.0, 3000.0])
 def test_it_asks_from_the_front_and_hardly_further_than_light_goes(density: float) -> None:
     scene, rays = scene_of(density), some_rays(150)

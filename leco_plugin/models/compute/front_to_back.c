@@ -2,7 +2,8 @@
  * compiles this file and calls it; the slow twin in torch is `models/front_to_back.py`.
  *
  * Many rays are on their way at once. Each in turn has its next few samples asked, in one batch with
- * those of the others; a ray leaves when its samples end or no light is left.
+ * those of the others: some first, the others where those are not faint. A ray leaves when its
+ * samples end or no light is left.
  */
 #include <math.h>
 #include <stdlib.h>
@@ -12,6 +13,7 @@
 
 #define CHUNK 2048   /* samples that are asked together; what is said of them stays in the cache */
 #define MOST_ROUTES 512
+#define NOT_ASKED (-1)
 
 /* As `front_to_back.py: in_c` fills it. */
 typedef struct {
@@ -28,24 +30,27 @@ typedef struct {
     const float *origins, *directions, *of_rays, *ends; /* [rays, ...] */
     const int64_t *starts, *counts;                     /* [rays], of samples */
     const float *given_starts, *given_ends;             /* [samples] */
+    const uint8_t *first;                               /* [samples], which are asked first */
     float *rgb, *accumulation, *distance;               /* [rays, ...], zero at first */
     int64_t *asked;                                     /* [rays], zero at first: of samples */
     int64_t *ray_indices, *routes;                      /* [samples], as all that follow */
     float *t_starts, *t_ends, *weights, *sigmas, *logits;
-    float least_light, visible, opaque;
+    float least_light, visible, opaque, faint;
     int at_once;
 } Batch;
 
 typedef struct {
     int64_t ray, next, last;
     float light;
+    int lit; /* whether its last sample is not faint */
 } Front;
 
 /* What is known of the samples of a chunk. */
 typedef struct {
     int64_t samples[CHUNK], rays[CHUNK], routes[CHUNK], order[CHUNK];
-    float mapped[3][CHUNK], unit[CHUNK][3], factors[CHUNK], raw[CHUNK], weights[CHUNK];
-    int seen[CHUNK];
+    float mapped[3][CHUNK], unit[CHUNK][3], factors[CHUNK], raw[CHUNK], alphas[CHUNK], weights[CHUNK];
+    int seen[CHUNK], lit[CHUNK]; /* lit: whether a sample, without the backdrop, is not faint */
+    int places[CHUNK];           /* where the next samples of each ray are, or NOT_ASKED */
     float *encoded, *logits, *hidden;
 } Chunk;
 
@@ -82,57 +87,104 @@ static void route(const Scene *scene, Chunk *chunk, int i)
     chunk->factors[i] = isnan(odds) ? NAN : 1.0f;
 }
 
-static void sort_by_route(Chunk *chunk, int count, int outputs)
+static void sort_by_route(Chunk *chunk, int begin, int end, int outputs)
 {
-    int places[MOST_ROUTES + 1] = {0};
-    for (int i = 0; i < count; i++)
+    int places[MOST_ROUTES + 1] = {begin};
+    for (int i = begin; i < end; i++)
         places[chunk->routes[i] + 1]++;
     for (int o = 1; o < outputs; o++)
         places[o] += places[o - 1];
-    for (int i = 0; i < count; i++)
+    for (int i = begin; i < end; i++)
         chunk->order[places[chunk->routes[i]]++] = i;
 }
 
-static void ask(const Scene *scene, const Batch *batch, Chunk *chunk, int count)
+/* What absorbs light at the samples from number `begin` to `end` of the chunk. */
+static void ask(const Scene *scene, const Batch *batch, Chunk *chunk, int begin, int end)
 {
-    for (int i = 0; i < count; i++)
+    for (int i = begin; i < end; i++)
         place(scene, batch, chunk, i);
-    gate_logits(chunk->mapped[0], scene->scales, scene->gate, chunk->logits, 0, count, CHUNK, 1,
+    gate_logits(chunk->mapped[0], scene->scales, scene->gate, chunk->logits, begin, end, CHUNK, 1,
                 scene->octaves, scene->fresh, scene->gate_layers, scene->gate_width,
                 scene->outputs, scene->epsilon);
-    for (int i = 0; i < count; i++)
+    for (int i = begin; i < end; i++)
         route(scene, chunk, i);
-    sort_by_route(chunk, count, scene->outputs);
-    hash_sums(chunk->unit[0], scene->resolutions, scene->table, chunk->encoded, 0, count,
+    sort_by_route(chunk, begin, end, scene->outputs);
+    hash_sums(chunk->unit[0], scene->resolutions, scene->table, chunk->encoded, begin, end,
               scene->levels, scene->log2, scene->features, 4);
     field_densities(chunk->encoded, chunk->order, chunk->routes, chunk->factors, scene->field,
-                    chunk->hidden, chunk->raw, 0, count, scene->levels * scene->features,
+                    chunk->hidden, chunk->raw, begin, end, scene->levels * scene->features,
                     scene->width, scene->layers);
+    for (int i = begin; i < end; i++) {
+        int64_t sample = chunk->samples[i];
+        float start = batch->given_starts[sample], end = batch->given_ends[sample];
+        float sigma = expf(chunk->raw[i] - 1.0f), half = scene->half_extent;
+        float absorbing = end >= batch->ends[chunk->rays[i]] ? sigma + batch->opaque : sigma;
+        chunk->alphas[i] = -expm1f(-absorbing * (end / half - start / half));
+        chunk->lit[i] = !(-expm1f(-sigma * (end / half - start / half)) < batch->faint);
+    }
 }
 
-/* Weighs the next samples of a ray, from number i of the chunk, and notes which of them are seen. */
-static int weigh(const Scene *scene, const Batch *batch, Chunk *chunk, Front *front, int64_t stop,
-                 int i, int seen)
+static int add(Chunk *chunk, int64_t sample, int64_t ray, int count)
 {
-    float half = scene->half_extent;
-    for (; front->next < stop; front->next++, i++) {
-        int64_t sample = front->next, ray = front->ray;
-        float start = batch->given_starts[sample], end = batch->given_ends[sample];
-        float sigma = expf(chunk->raw[i] - 1.0f);
-        float absorbing = end >= batch->ends[ray] ? sigma + batch->opaque : sigma;
-        float alpha = -expm1f(-absorbing * (end / half - start / half));
-        float weight = front->light * alpha;
-        front->light *= 1.0f - alpha;
-        batch->accumulation[ray] += weight;
-        batch->distance[ray] += weight * 0.5f * (start + end);
-        batch->weights[sample] = chunk->weights[i] = weight;
-        batch->sigmas[sample] = sigma;
-        batch->routes[sample] = chunk->routes[i];
-        memcpy(batch->logits + sample * scene->outputs,
-               chunk->logits + (int64_t)i * scene->outputs, scene->outputs * sizeof(float));
-        if (weight > batch->visible)
-            chunk->seen[seen++] = i;
+    chunk->samples[count] = sample;
+    chunk->rays[count] = ray;
+    return count;
+}
+
+/* How many of a ray's samples come next. */
+static int length_of(const Batch *batch, const Front *front)
+{
+    int64_t left = front->last - front->next;
+    return left < batch->at_once ? (int)left : batch->at_once;
+}
+
+/* Asks of the next samples of each ray those that come first, and then those with a neighbour that
+ * is not faint. Not asking needs a sample before and one after it: both ends of a stretch come first,
+ * and so does the last of an even number of samples. */
+static void ask_next(const Scene *scene, const Batch *batch, Chunk *chunk, Front *fronts, int alive)
+{
+    int count = 0;
+    for (int f = 0; f < alive; f++) {
+        int *places = chunk->places + f * batch->at_once, length = length_of(batch, fronts + f);
+        for (int k = 0; k < length; k++) {
+            int64_t sample = fronts[f].next + k;
+            places[k] = batch->first[sample] ? add(chunk, sample, fronts[f].ray, count++) : NOT_ASKED;
+        }
     }
+    ask(scene, batch, chunk, 0, count);
+    int begin = count;
+    for (int f = 0; f < alive; f++) {
+        int *places = chunk->places + f * batch->at_once, length = length_of(batch, fronts + f);
+        for (int k = 0; k < length; k++) {
+            int64_t sample = fronts[f].next + k;
+            if (batch->first[sample])
+                fronts[f].lit = chunk->lit[places[k]];
+            else if (fronts[f].lit || chunk->lit[places[k + 1]])
+                places[k] = add(chunk, sample, fronts[f].ray, count++);
+        }
+    }
+    ask(scene, batch, chunk, begin, count);
+}
+
+/* Weighs a sample of a ray, number i of the chunk, and notes whether it is seen. */
+static int weigh(const Scene *scene, const Batch *batch, Chunk *chunk, Front *front, int i, int seen)
+{
+    int64_t sample = chunk->samples[i], ray = front->ray;
+    int64_t to = batch->starts[ray] + batch->asked[ray]++;
+    float start = batch->given_starts[sample], end = batch->given_ends[sample];
+    float weight = front->light * chunk->alphas[i];
+    front->light *= 1.0f - chunk->alphas[i];
+    batch->accumulation[ray] += weight;
+    batch->distance[ray] += weight * 0.5f * (start + end);
+    batch->t_starts[to] = start;
+    batch->t_ends[to] = end;
+    batch->weights[to] = chunk->weights[i] = weight;
+    batch->sigmas[to] = expf(chunk->raw[i] - 1.0f);
+    batch->routes[to] = chunk->routes[i];
+    memcpy(batch->logits + to * scene->outputs, chunk->logits + (int64_t)i * scene->outputs,
+           scene->outputs * sizeof(float));
+    if (weight > batch->visible)
+        chunk->seen[seen++] = i;
     return seen;
 }
 
@@ -142,14 +194,14 @@ static int64_t pack(const Scene *scene, const Batch *batch, int64_t begin, int64
     int64_t first = begin < end ? batch->starts[begin] : 0, to = first;
     for (int64_t ray = begin; ray < end; ray++) {
         int64_t from = batch->starts[ray], count = batch->asked[ray];
-#define MOVE(OUT, IN, SIZE)                                                                        \
-    memmove(batch->OUT + to * (SIZE), batch->IN + from * (SIZE), count * (SIZE) * sizeof *batch->OUT)
-        MOVE(t_starts, given_starts, 1);
-        MOVE(t_ends, given_ends, 1);
-        MOVE(weights, weights, 1);
-        MOVE(sigmas, sigmas, 1);
-        MOVE(routes, routes, 1);
-        MOVE(logits, logits, scene->outputs);
+#define MOVE(OUT, SIZE)                                                                            \
+    memmove(batch->OUT + to * (SIZE), batch->OUT + from * (SIZE), count * (SIZE) * sizeof *batch->OUT)
+        MOVE(t_starts, 1);
+        MOVE(t_ends, 1);
+        MOVE(weights, 1);
+        MOVE(sigmas, 1);
+        MOVE(routes, 1);
+        MOVE(logits, scene->outputs);
         for (int64_t i = to; i < to + count; i++)
             batch->ray_indices[i] = ray;
         to += count;
@@ -175,24 +227,18 @@ int64_t front_to_back(const Scene *scene, const Batch *batch, int64_t begin, int
         for (; next < end && alive < CHUNK / batch->at_once; next++)
             if (batch->counts[next]) {
                 int64_t first = batch->starts[next];
-                fronts[alive++] = (Front){next, first, first + batch->counts[next], 1.0f};
+                fronts[alive++] = (Front){next, first, first + batch->counts[next], 1.0f, 0};
             }
-        int count = 0, seen = 0, left = 0;
-        for (int f = 0; f < alive; f++)
-            for (int64_t s = fronts[f].next; s < fronts[f].last && s < fronts[f].next + batch->at_once; s++) {
-                chunk->samples[count] = s;
-                chunk->rays[count++] = fronts[f].ray;
-            }
-        ask(scene, batch, chunk, count);
-        for (int f = 0, i = 0; f < alive; f++) {
+        int seen = 0, left = 0;
+        ask_next(scene, batch, chunk, fronts, alive);
+        for (int f = 0; f < alive; f++) {
             Front front = fronts[f];
-            int64_t stop = front.next + batch->at_once;
-            stop = stop < front.last ? stop : front.last;
-            int last = i + (int)(stop - front.next);
-            seen = weigh(scene, batch, chunk, &front, stop, i, seen);
-            i = last;
-            batch->asked[front.ray] = stop - batch->starts[front.ray];
-            if (stop < front.last && front.light >= batch->least_light)
+            int *places = chunk->places + f * batch->at_once, length = length_of(batch, &front);
+            for (int k = 0; k < length; k++)
+                if (places[k] != NOT_ASKED)
+                    seen = weigh(scene, batch, chunk, &front, places[k], seen);
+            front.next += length;
+            if (front.next < front.last && front.light >= batch->least_light)
                 fronts[left++] = front;
         }
         alive = left;
