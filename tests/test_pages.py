@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import json
 import os
@@ -9,6 +10,7 @@ import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -193,6 +195,24 @@ def test_lines_of_the_log_are_those_that_are_logged(file: str, line: str) -> Non
     assert re.search(values, (PACKAGE / file).read_text())
     (table,) = re.findall(r"\| line \| .*?\n\n", GPU, re.DOTALL)
     assert re.search(values, table)
+
+
+def spoken(path: Path) -> Iterator[str]:
+    """Strings of a module that are no docstrings, with `...` for the values in them."""
+    for parent in ast.walk(ast.parse(path.read_text())):
+        for child in ast.iter_child_nodes(parent) if not isinstance(parent, ast.Expr) else ():
+            parts = child.values if isinstance(child, ast.JoinedStr) else [child]
+            said = [getattr(part, "value", None) for part in parts]
+            if isinstance(child, ast.Constant | ast.JoinedStr):
+                yield "".join(each if isinstance(each, str) else "..." for each in said)
+
+
+def test_lines_on_the_page_of_troubles_are_those_that_are_said() -> None:
+    said = "\n".join(line for path in PACKAGE.rglob("*.py") for line in spoken(path))
+    rows = re.findall(r"^\| (.*?) \| .* \|$", TEXTS["troubles"], re.MULTILINE)
+    quoted = [quote for row in rows for quote in re.findall("`([^`]*)`", row) if " " in quote]
+    assert len(quoted) > 60
+    assert [quote for quote in quoted if quote not in re.sub(r"%\w", "...", said)] == []
 
 
 def test_the_published_tables_are_those_of_the_stored_results(
