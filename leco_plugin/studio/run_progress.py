@@ -176,8 +176,8 @@ class RunProgress:
         if occupancy.exists():
             say(f"  occupancy  {occupancy}, {occupancy.stat().st_size / 1e3:.0f} kB")
         say("next:")
-        tested = bool(self.trainer.pipeline.datamanager.eval_dataset)
-        for command in next_commands(folder, occupancy.exists(), tested):
+        tests = len(self.trainer.pipeline.datamanager.eval_dataset or ())
+        for command in next_commands(folder, occupancy.exists(), tests):
             say(f"  {command}")
 
 
@@ -193,22 +193,26 @@ def at_end(path: Path, field: float | None, one_colour: float) -> Occupancy:
     return occupancy
 
 
-def next_commands(folder: Path, occupancy: bool, tests: bool) -> list[str]:
-    """What to run after a run: to look at it, to measure it if there are photographs for `tests`,
-    and to take its occupancy elsewhere if it has left one."""
-    config = shlex.quote(str(folder / CONFIG))
+def next_commands(folder: Path, occupancy: bool, tests: int) -> list[str]:
+    """What to run after a run: to look at it, to film it, to measure it if there are `tests`,
+    photographs to test with, and to draw its occupancy and take it elsewhere if it has left one."""
 
-    def out(name: str) -> str:
+    def at(name: str) -> str:
         return shlex.quote(str(folder / name))
 
-    viewer = f"ns-viewer --load-config {config}"
-    evaluate = f"ns-eval --load-config {config} --output-path {out('eval.json')}"
-    path = out("path.mp4") if shutil.which("ffmpeg") else f"{out('path')} --output-format images"
-    render = f"ns-render interpolate --load-config {config} --output-path {path}"
-    export = f"leco export {out(FILE_NAME)} --out {out('export')}"
-    if not tests:
-        evaluate = f"{render} --pose-source train"
-    return [viewer, evaluate, *([export] if occupancy else [])]
+    config = f"--load-config {at(CONFIG)}"
+    film = at("film.mp4") if shutil.which("ffmpeg") else f"{at('film')} --output-format images"
+    between = "" if tests > 1 else " --pose-source train"
+    commands = [
+        f"ns-viewer {config}",
+        f"ns-render interpolate {config} --output-path {film} --downscale-factor 4{between}",
+    ]
+    if tests:
+        commands.append(f"ns-eval {config} --output-path {at('eval.json')}")
+    if occupancy:
+        commands.append(f"leco inspect {at(FILE_NAME)} --picture {at('occupancy.png')}")
+        commands.append(f"leco export {at(FILE_NAME)} --out {at('export')}")
+    return commands
 
 
 def _phase(trainer: Any) -> str:

@@ -64,7 +64,8 @@ def test_the_screen_fits_and_ends_with_what_to_do_next(
     assert re.search(r"photographs to learn from, \d+ to test with, 32 x 32; ", screen)
     assert "sizes: " in screen and "bounds: " in screen and "occupancy learned in" in screen
     assert re.search(r"finished: 12 steps in .*, \d+\.\d dB on [\d,]+ held-out pixels", screen)
-    assert [line.split()[0] for line in lines[-3:]] == ["ns-viewer", "ns-eval", "leco"]
+    named = [line.split()[0] for line in lines[lines.index("next:") + 1 :]]
+    assert named == ["ns-viewer", "ns-render", "ns-eval", "leco", "leco"]
     assert str(folder / "occupancy.safetensors") in screen
     for detail in ("DataParallelTrainerConfig(", "Caching all", "hash table", "scene units  "):
         assert detail not in screen
@@ -110,7 +111,7 @@ def test_a_guided_host_shows_psnr_while_it_learns_and_after(
     lines, log, _ = run(config, capsys)
     assert len(lines) <= MOST_LINES
     reached = r"finished: 3 steps in .*, \d+\.\d dB on [\d,]+ held-out pixels"
-    assert sum(re.search(reached, line) is not None for line in lines[-9:-6]) == 1
+    assert sum(re.search(reached, line) is not None for line in lines[-11:-8]) == 1
     learning, _, training = log.partition("occupancy learned in")
     assert "measured in" in learning and "measured in" in training
 
@@ -154,8 +155,12 @@ def test_what_is_measured_changes_no_weight(
 
 
 def test_commands_are_of_what_there_is() -> None:
-    viewer, evaluate, export = next_commands(Path("a run"), occupancy=True, tests=True)
+    viewer, film, evaluate, inspect, export = next_commands(Path("a run"), occupancy=True, tests=2)
     assert viewer == "ns-viewer --load-config 'a run/config.yml'"
+    assert film.startswith("ns-render interpolate ") and "--pose-source" not in film
     assert evaluate.startswith("ns-eval ") and export.startswith("leco export 'a run/occ")
-    _, render = next_commands(Path("run"), occupancy=False, tests=False)
-    assert render.startswith("ns-render interpolate ") and render.endswith("--pose-source train")
+    assert inspect.endswith("'a run/occupancy.safetensors' --picture 'a run/occupancy.png'")
+    _, film, *_ = next_commands(Path("run"), occupancy=True, tests=1)
+    assert film.endswith("--pose-source train"), "a film is between two photographs"
+    _, film = next_commands(Path("run"), occupancy=False, tests=0)
+    assert film.startswith("ns-render interpolate ") and film.endswith("--pose-source train")
