@@ -26,7 +26,7 @@ from leco_plugin.cli_experiments import capacity, chart, check, stability
 from leco_plugin.cli_occupancy import export, inspect, shrink
 from leco_plugin.names import is_like, options_in, unknown_name
 from leco_plugin.scenes.input_error import one_line
-from leco_plugin.scenes.whole_files import check_place, write_report
+from leco_plugin.scenes.whole_files import check_apart, check_place, write_report
 
 BAD_INPUT, FAILURE = 2, 1
 FEW_PICTURES = 20
@@ -188,6 +188,7 @@ def swap(
     from leco_plugin.swap import swapped_config
 
     check_place("--json", json)
+    check_apart({"--json": json}, occupancy)
     config = swapped_config(
         method, occupancy, arguments, sampler, options, codes, other_scene, learn_seconds
     )

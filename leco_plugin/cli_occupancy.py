@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from leco_plugin.scenes.whole_files import check_picture, check_place, write_report
+from leco_plugin.scenes.whole_files import check_apart, check_picture, check_place, write_report
 
 if TYPE_CHECKING:
     from leco_plugin.occupancy import Occupancy
@@ -66,6 +66,7 @@ def inspect(
     from leco_plugin.occupancy import Occupancy
 
     file = occupancy_of(file)
+    check_apart({"--picture": picture, "--history": history, "--json": json}, file)
     occupancy = Occupancy.load(file)
     facts = {**describe(occupancy), "bytes": file.stat().st_size}
     space = facts["space"]
@@ -130,6 +131,7 @@ def export(
 
     check_place("--json", json)
     file = occupancy_of(file)
+    check_apart({"--out": out, "--json": json}, file)
     if format is not None:
         facts = made.export(file, format, out, resolution, levels, frame, data)
         print("\n".join(_export_in_words(out, facts, frame)))
@@ -201,10 +203,9 @@ def shrink(
 
     check_place("--json", json)
     check_picture("--picture", picture)
-    bounds = Bounds(lost_surface_mass, image_price)
-    results = find_smaller(
-        occupancy_of(file), data, out, bounds, keep=lambda known: write_report(json, known)
-    )
+    file, bounds = occupancy_of(file), Bounds(lost_surface_mass, image_price)
+    check_apart({"--out": out, "--picture": picture, "--json": json}, file)
+    results = find_smaller(file, data, out, bounds, keep=lambda known: write_report(json, known))
     print("\n".join(summary(results, out)))
     write_report(json, results)
     if picture is not None:

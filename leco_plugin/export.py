@@ -53,14 +53,15 @@ from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.grid import OccupancyGridEstimator
 from leco_plugin.scenes.coloured_points import georeference
 from leco_plugin.scenes.frames import moved
-from leco_plugin.scenes.whole_files import check_place, write_whole
+from leco_plugin.scenes.whole_files import check_apart, check_place, write_whole
 
 Format = Literal["ply", "splat-init", "npz", "nerfacc-grid"]
 Frame = Literal["data", "run"]
 STEPS = 2
 """Steps from one corner of a grid's cell to the next: 27 probed points, those on faces shared."""
 POINTS_AT_ONCE = 1 << 20
-MOST_LEVELS = 8
+MOST_LEVELS, MOST_BOXES = 8, 64
+"""Levels of a grid where nobody names a number, and of any: each box is twice as wide."""
 
 
 def export(
@@ -95,6 +96,7 @@ def export(
     """
     _check_options(format, levels, frame, data)
     check_place("--out", out)
+    check_apart({"--out": out}, file)
     occupancy = Occupancy.load(file)
     back = None if frame == "run" else to_the_data(occupancy)
     if back is None and (frame == "data" or format == "splat-init"):
@@ -218,9 +220,10 @@ def grid_buffers(
     unbounded = occupancy.space.kind != "box"
     if levels is None:
         levels = reaching_levels(occupancy) if unbounded else 1
-    if resolution < 1 or levels < 1:
+    if resolution < 1 or not 1 <= levels <= MOST_BOXES:
         raise ValueError(
-            f"{levels} levels of {resolution}^3 cells: a grid has at least one level and one cell"
+            f"{levels} levels of {resolution}^3 cells: a grid has one cell or more, and 1 to "
+            f"{MOST_BOXES} levels"
         )
     require_few(levels * resolution**3, f"{levels} x {resolution}^3")
     if unbounded and levels == 1:

@@ -279,6 +279,30 @@ def test_a_place_that_cannot_be_written_to_is_named_before_anything_is_read_or_w
 
 
 @pytest.mark.parametrize(
+    "command",
+    [
+        ["inspect", "{file}", "--json", "{file}"],
+        ["inspect", "{file}", "--picture", "x.png", "--json", "sub/../x.png"],
+        ["export", "{file}", "--format", "npz", "--out", "{file}"],
+        ["export", "{folder}", "--format", "nerfacc-grid", "--out", "{file}"],
+        ["export", "{file}", "--format", "ply", "--out", "x.ply", "--json", "x.ply"],
+        ["shrink", "{file}", "--data", "{folder}", "--out", "x", "--json", "{file}"],
+        ["swap", "nerfacto", "--occupancy", "{file}", "--json", "{file}"],
+    ],
+)
+def test_no_command_writes_over_what_it_reads_or_over_what_it_has_just_written(
+    command: list[str], here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = here / "run" / "occupancy.safetensors"
+    file.parent.mkdir()
+    ball().save(file)
+    before, arguments = file.read_bytes(), [part.format(file=file, folder=here) for part in command]
+    assert run(*arguments) == 2
+    assert f"leco: {command[-2]} {arguments[-1]} is a file that" in capsys.readouterr().err
+    assert file.read_bytes() == before and not (here / "x.ply").exists()
+
+
+@pytest.mark.parametrize(
     ("option", "name", "command"),
     [
         ("--json", "x.json", ["check", "grit"]),

@@ -46,7 +46,7 @@ from leco_plugin.learning.sharpening import round_weights
 from leco_plugin.log import bar, put
 from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
 from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler
-from leco_plugin.scenes.whole_files import check_place
+from leco_plugin.scenes.whole_files import check_apart, check_place
 
 RAYS = 4096
 TAUGHT_RAYS = 6144
@@ -116,8 +116,7 @@ def shrink(
 
 def _open(file: Path, data: Path, out: Path, bounds: Bounds) -> tuple[Source, Occupancy]:
     check_place("--out", out)
-    if out.exists() and out.samefile(file):
-        raise ValueError(f"--out {out} is the occupancy itself; name another file")
+    check_apart({"--out": out}, file)
     original = Occupancy.load(file)
     _check_original(original, file, bounds)
     random.seed(0)  # nerfstudio caches images in an order of its own

@@ -24,7 +24,14 @@ from leco_plugin.scenes.frames import (
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.lenses import lens_of
 from leco_plugin.scenes.photograph_files import find_file
-from leco_plugin.scenes.scene_file import SceneFile, file_in, load_json, poses_in
+from leco_plugin.scenes.scene_file import (
+    NO_SCENE,
+    SceneFile,
+    file_in,
+    load_json,
+    not_a_scene,
+    poses_in,
+)
 from leco_plugin.scenes.whole_files import FETCH, is_pointer
 
 CONFIG = "config.yml"
@@ -91,10 +98,15 @@ def _data_named_in(config: Path) -> Path | None:
 
 
 def description_in(data: Path) -> Path:
-    """The transforms.json that `data` means: itself, or that in the folder. InputError for none."""
+    """The transforms.json that `data` means: itself, or that in the folder. InputError for none, or
+    one without frames."""
     file = file_in(data)
     if not file.is_file():
         raise InputError(f"--data {data}: there is no transforms.json; give a nerfstudio scene")
+    try:
+        load_json(file)["frames"]
+    except NO_SCENE as error:
+        raise not_a_scene(file, error) from None
     return file
 
 

@@ -103,6 +103,13 @@ def poses_in(frames: list[dict[str, Any]]) -> NDArray[np.float64]:
     return np.array([frame["transform_matrix"] for frame in frames], dtype=float)
 
 
+def not_a_scene(path: Path, error: BaseException) -> InputError:
+    """What to raise for a transforms.json that cannot be read as one: one of `NO_SCENE`."""
+    reason = f"{type(error).__name__}: {one_line(error, 120)}"
+    fault = f"{path} is not a scene in nerfstudio's format ({reason})"
+    return InputError(f"{fault}; mend it, or {MAKE_ANEW}")
+
+
 def read_scene_file(path: Path, split: str, folder: Path) -> SceneFile:
     """A transforms.json, its pictures relative to `folder`. InputError if its poses or lenses are
     none that cameras have, or all cameras of a training split are in one place."""
@@ -115,9 +122,7 @@ def read_scene_file(path: Path, split: str, folder: Path) -> SceneFile:
             raise ValueError("a file_path is no path")
         poses = poses_in(frames)
     except NO_SCENE as error:
-        reason = f"{type(error).__name__}: {one_line(error, 120)}"
-        fault = f"is not a scene in nerfstudio's format ({reason})"
-        raise InputError(f"{path} {fault}; mend it, or {MAKE_ANEW}") from None
+        raise not_a_scene(path, error) from None
     if len(frames) == 0:
         fault = "has no cameras: its list of frames is empty"
         raise InputError(f"{path} {fault}; {MAKE_ANEW}")

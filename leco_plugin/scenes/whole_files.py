@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -101,6 +101,21 @@ def check_place(option: str, path: Path | None) -> None:
         raise InputError(f"{option} {path}: {nearest} is a file, not a folder")
     with writing_into(nearest, option), TemporaryFile(dir=nearest):
         pass
+
+
+def check_apart(written: Mapping[str, Path | None], *read: Path | None) -> None:
+    """InputError if a file to write, known by its option, is one that a command reads, or another
+    that it writes."""
+    taken = {path.resolve() for path in read if path is not None}
+    for option, path in written.items():
+        if path is None:
+            continue
+        if path.resolve() in taken:
+            fault = (
+                f"{option} {path} is a file that this command reads, or writes by another option"
+            )
+            raise InputError(f"{fault}: give another name")
+        taken.add(path.resolve())
 
 
 def check_picture(option: str, path: Path | None, moving: bool = False) -> None:

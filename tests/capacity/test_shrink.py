@@ -181,7 +181,7 @@ def test_bad_input_ends_with_one_line_and_status_2(
         "skips 4.0% of all candidates": [changed("foggy", empty_fraction=0.04), *data, *out],
         "of the 20 cameras": [changed("elsewhere", cameras=cameras), *data, *out],
         "is a folder": [ball, *data, "--out", tmp_path],
-        "is the occupancy itself": [ball, *data, "--out", ball],
+        "is a file that this command reads": [ball, *data, "--out", ball],
         "not a folder": [ball, *data, "--out", ball / "new" / "small"],
         "ends in none of": [ball, *data, *out, "--picture", tmp_path / "a.doc"],
         "give an occupancy.safetensors": [tmp_path / "none.safetensors", *data, *out],

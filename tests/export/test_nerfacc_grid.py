@@ -101,7 +101,7 @@ def test_an_unbounded_scene_gets_levels_as_far_as_its_rays() -> None:
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(("resolution", "levels"), [(0, 1), (4, 0), (1024, 1)])
+@pytest.mark.parametrize(("resolution", "levels"), [(0, 1), (4, 0), (4, 65), (1024, 1)])
 def test_sizes_out_of_range_are_refused(resolution: int, levels: int) -> None:
     with pytest.raises(ValueError, match="cells"):
         grid_buffers(ball(), resolution, levels)

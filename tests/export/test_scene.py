@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 from ball_occupancy import CENTRE, RADIUS, ball
+from scene_files import refused
 from scipy.spatial.transform import Rotation
 
 from leco_plugin.chart.theme import new_figure, save_picture
@@ -257,6 +258,15 @@ def test_another_scene_gives_no_colours_and_no_start_for_splats(
         with pytest.raises(ValueError, match="0 of the 3 cameras that the occupancy names are in"):
             export(file, format, tmp_path / out, 16, data=scene)
     assert not export(file, "ply", tmp_path / "k.ply", 16)["photograph_colours"]
+
+
+@pytest.mark.parametrize("said", ["", "{", "[1]", '{"frames": null}'])
+def test_a_scene_that_is_none_is_named(said: str, file: Path, scene: Path, tmp_path: Path) -> None:
+    (scene / "transforms.json").write_text(said)
+    ball().save(tmp_path / "silent.st")  # says nothing of its cameras' places in the data
+    for known in (file, tmp_path / "silent.st"):
+        with refused(r"scene/transforms\.json is not a scene in nerfstudio's format \("):
+            export(known, "ply", tmp_path / "k.ply", 16, data=scene)
 
 
 def test_a_picture_that_a_full_disk_cuts_off_replaces_no_older_one(
