@@ -37,7 +37,7 @@ from leco_plugin.scenes.coloured_points import (
     georeference,
     views_of,
 )
-from leco_plugin.scenes.frames import inverse, moved
+from leco_plugin.scenes.frames import applied_in, inverse, moved
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photograph_files import find_file
 from leco_plugin.scenes.scene_file import load_json
@@ -280,7 +280,7 @@ def require_not_its_own(out: Path, description: Path) -> None:
 
 def _from_elsewhere(meta: dict[str, Any], scene: Path, folder: Path) -> dict[str, Any]:
     """A scene's description for another folder: its photographs stay where they are."""
-    home = folder.resolve()
+    home, (applied, _) = folder.resolve(), applied_in(meta, scene)
     if home == scene.resolve():
         return meta
 
@@ -292,7 +292,8 @@ def _from_elsewhere(meta: dict[str, Any], scene: Path, folder: Path) -> dict[str
         for frame in meta["frames"]
     ]
     splits = {key: [from_there(x) for x in meta[key]] for key in meta if key.endswith("_filenames")}
-    return meta | splits | {"frames": frames}
+    known = {} if applied is None else {"applied_transform": applied}
+    return meta | known | splits | {"frames": frames}
 
 
 def write_volume(

@@ -226,6 +226,14 @@ def check_poses(poses: NDArray[np.floating], names: list[str]) -> None:
         raise InputError(f"{worst} is no rotation: {remedy}")
 
 
+def check_no_contradiction(poses: NDArray[np.floating], names: list[str]) -> None:
+    """InputError for a name to which two of finite poses [C, 3 or 4, 4] belong."""
+    first: dict[str, int] = {}
+    for number, name in enumerate(names):
+        if (poses[number] != poses[first.setdefault(name, number)]).any():
+            raise InputError(f"{name} is given twice, and differs: remove one of these frames")
+
+
 # Structure from motion does not know what is down, and nerfstudio takes the photographs' top edges
 # for up: of cameras that look straight down these are level, and point in any direction.
 

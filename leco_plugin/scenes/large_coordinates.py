@@ -23,12 +23,15 @@ from torch import Tensor
 
 from leco_plugin.log import say
 from leco_plugin.scenes.frames import APPLIED, applied_in, inverse, moved, parsed_frame
-from leco_plugin.scenes.scene_file import load_json, poses_in
+from leco_plugin.scenes.scene_file import file_in, load_json, poses_in
 
 FAR = 100.0
 """Times the cameras' spread. Nearer to the origin float32 rounds to less than 1e-5 of it."""
 SEAMS = {"load_from_json", "_get_all_images_and_cameras"}
 """What nerfstudio's readers call for the poses of a file, float64 still."""
+
+COUNT_BYTES = 8
+"""Of a points3D.bin the number of points, before these."""
 
 Array = NDArray[np.float64]
 
@@ -77,7 +80,8 @@ class ReadsNear(DataParser):
         near.__kwdefaults__ = read.__kwdefaults__
         outputs: DataparserOutputs = near(self, split, **kwargs)
         if isinstance(self, Nerfstudio):
-            outputs.metadata[APPLIED] = applied_in(self._meta or {}, self.config.data)
+            folder = file_in(self.config.data).parent
+            outputs.metadata[APPLIED] = applied_in(self._meta or {}, folder)
         if self.shift is None or not self.shift.any():
             return outputs
         transform = torch.as_tensor(outputs.dataparser_transform).double()[:3].clone()
@@ -89,7 +93,10 @@ class ReadsNear(DataParser):
         return self._near(super()._get_all_images_and_cameras(*arguments))  # type: ignore[misc]
 
     def _load_3D_points(self, path: Path, *given: Any) -> dict[str, Tensor] | None:
-        """Sparse points in model coordinates and what belongs to them."""
+        """Sparse points in model coordinates and what belongs to them; nothing of a model of COLMAP
+        that has none, as one made of known poses."""
+        if path.is_dir() and not _has_points(path):
+            return {}
         found: dict[str, Tensor] | None = super()._load_3D_points(path, *given)  # type: ignore[misc]
         if found and self.shift is not None and self.shift.any():
             config: Any = self.config
@@ -105,6 +112,9 @@ class ReadsNear(DataParser):
             positions = poses[:, :3, 3]
         except (KeyError, TypeError, ValueError, IndexError):
             return meta  # no poses, or none that any reader takes
+        if isinstance(self, Nerfstudio):  # else it is not the same by the folder and by the file
+            applied, _ = applied_in(meta, file_in(self.config.data).parent)
+            meta = meta if applied is None else meta | {"applied_transform": applied}
         self._meta = meta
         if self.shift is None:
             origin = far_origin(positions)
@@ -138,6 +148,17 @@ class ReadsNear(DataParser):
             read, name = colmap_parsing_utils.read_points3D_text, "points3D.txt"
         points = np.array([point.xyz for point in read(path / name).values()], dtype=float)
         return points - self._in_the_data()
+
+
+def _has_points(model: Path) -> bool:
+    """Whether a model of COLMAP may have points: False where their file is not there, or whole and
+    of none."""
+    if (file := model / "points3D.bin").exists():
+        return file.stat().st_size != COUNT_BYTES
+    if not (file := model / "points3D.txt").exists():
+        return False
+    with file.open("rb") as lines:
+        return any(line.strip() and not line.startswith(b"#") for line in lines)
 
 
 def near_bases(kind: type[DataParser]) -> tuple[type[DataParser], ...]:

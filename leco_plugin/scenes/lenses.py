@@ -80,9 +80,14 @@ def lens_of(meta: dict[str, Any], frame: dict[str, Any], where: str) -> Lens:
     distortion = _distortion(frame, kind, where) or _distortion(meta, kind, where)
     cx, cy = said("cx", positive=False), said("cy", positive=False)
     width, height = said("w"), said("h")
+    given, full = "", math.inf if width is None else width
     if fx and width and fx < SHORTEST * width and kind in (None, *MIXED):
-        given = f"{where}: fl_x is {fx:g} where w is {width:g}"
-        raise InputError(f"{given}: give focal lengths and cx, cy in pixels, not in shares")
+        given = f"fl_x is {fx:g} where w is {width:g}"
+    elif cx is not None and cy is not None and 0.0 <= min(cx, cy) <= max(cx, cy) <= 1.0 < full / 2:
+        given = f"cx is {cx:g} and cy is {cy:g}"
+    if given:
+        remedy = "give focal lengths and cx, cy in pixels, not in shares"
+        raise InputError(f"{where}: {given}: {remedy}")
     radius = said("fisheye_crop_radius") if kind in FISHEYES else None
     return Lens(kind, fx, fy, cx, cy, width, height, distortion, angle_x, angle_y, radius)
 

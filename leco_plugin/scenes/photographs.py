@@ -56,7 +56,10 @@ class LecoPhotographs(CheckedReader, ReadsNear, Nerfstudio):
         outputs: DataparserOutputs = super()._generate_dataparser_outputs(split)
         if len(outputs.image_filenames) == 0 and split == "train":
             none = f"{data}: no image is left for the split {split!r}"
-            raise InputError(f"{none}: list some in train_filenames, or remove it")
+            remedy = "hold out fewer for tests, as by a larger --train-split-fraction"
+            if "train_filenames" in meta:
+                remedy = "list some in train_filenames, or remove it"
+            raise InputError(f"{none}: {remedy}")
         if up_is_known:
             outputs.metadata[UP_IS_KNOWN] = True
         return outputs

@@ -26,10 +26,17 @@ from leco_plugin.log import bar, by_number, counted, say
 from leco_plugin.scenes import photograph_files, scene_file
 from leco_plugin.scenes.coloured_points import told_by
 from leco_plugin.scenes.frames import check_poses
-from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.input_error import InputError, one_line, require
 from leco_plugin.scenes.large_coordinates import near_bases
 from leco_plugin.scenes.lenses import Lens, set_lenses
-from leco_plugin.scenes.photograph_files import DerivedImages, Header, decode, header_of, is_plain
+from leco_plugin.scenes.photograph_files import (
+    DerivedImages,
+    Header,
+    decode,
+    find_file,
+    header_of,
+    is_plain,
+)
 from leco_plugin.scenes.scene_file import SceneFile, command_with, description_of
 from leco_plugin.studio.checkpoints import require_data
 
@@ -50,6 +57,8 @@ class CheckedReader(DataParser):
         """As the reader's. InputError, in one line, for whatever goes wrong."""
         config: Any = self.config
         require_data(Path(config.data))
+        factor = getattr(config, "downscale_factor", None)
+        require(factor is None or factor > 0, "downscale_factor", factor, "1 or more")
         scene = scene_file.scene_file_of(config, split)
         try:
             read = super().get_dataparser_outputs(split=split, **options)
@@ -65,6 +74,8 @@ class CheckedReader(DataParser):
         except (Exception, SystemExit) as error:
             for path in () if scene is None else scene.pictures():
                 _ = header_of(path) if path.is_file() else None  # one that is none goes first
+            if scene is not None and isinstance(self, Nerfstudio):
+                _check_lists(scene)
             fault = f"{Path(config.data)} cannot be read as a scene by {reader_name(config)}"
             raise InputError(f"{fault}: {_reason(error)}; {_remedy(error, config)}") from error
         if len(self._first) == 2:
@@ -107,6 +118,20 @@ def reader_name(config: Any) -> str:
     return names[0] if names else type(config).__name__
 
 
+def _check_lists(scene: SceneFile) -> None:
+    """InputError for a list of photographs, as of those for tests, that is none or names others
+    than frames do."""
+    known = {*scene.pictures()}
+    for key in ("train_filenames", "val_filenames", "test_filenames"):
+        listed = scene.meta.get(key, [])
+        if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
+            raise InputError(f"{scene.path}: {key} is no list of names: list the file_path of each")
+        for name in listed:
+            if find_file(scene.folder / name) not in known:
+                fault = f"{scene.path}: {key} has {name}, and no frame has"
+                raise InputError(f"{fault}: write it as its file_path")
+
+
 def _reason(error: BaseException) -> str:
     said = one_line(error, 200).rstrip(".")
     if isinstance(error, EOFError | SystemExit):
@@ -145,7 +170,7 @@ def _remedy(error: BaseException, config: Any) -> str:
         return photograph_files.SAVE_ANEW
     if isinstance(error, FileNotFoundError | NotADirectoryError):
         return "put that file there, or remove what names it"
-    file = description_of(config, "train") or data
+    file = description_of(config, "train") or data / getattr(config, "colmap_path", "")
     if isinstance(error, KeyError):
         return f"add {one_line(error, 40)} to {file}"
     return f"mend {file}"

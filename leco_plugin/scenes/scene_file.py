@@ -16,7 +16,7 @@ from nerfstudio.cameras.cameras import Cameras
 from numpy.typing import NDArray
 
 from leco_plugin.log import by_number, say
-from leco_plugin.scenes.frames import check_poses
+from leco_plugin.scenes.frames import check_no_contradiction, check_poses
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.lenses import (
     ANGLES,
@@ -66,12 +66,15 @@ def file_in(data: Path) -> Path:
 
 
 def load_json(path: Path) -> Any:
-    """What a JSON file says, with or without a byte order mark. Nulls are left out, and poses of
-    three rows have the fourth."""
+    """What a JSON file says, with or without a byte order mark. Nulls are left out, poses of three
+    rows have the fourth, and an `applied_transform` of four has three."""
     said = _parsed(path.read_bytes())
     if not isinstance(said, dict):
         return said
     said = _without_nulls(said)
+    applied = said.get("applied_transform")
+    if isinstance(applied, list) and applied[3:] == [[0, 0, 0, 1]]:
+        said["applied_transform"] = applied[:3]
     for name in FRAMES:
         if isinstance(said.get(name), list):
             said[name] = [_completed(frame) for frame in said[name]]
@@ -126,7 +129,9 @@ def read_scene_file(path: Path, split: str, folder: Path) -> SceneFile:
     if len(frames) == 0:
         fault = "has no cameras: its list of frames is empty"
         raise InputError(f"{path} {fault}; {MAKE_ANEW}")
-    check_poses(poses, [f"{path}: the transform_matrix of {name}" for name in names])
+    of_each = [f"{path}: the transform_matrix of {name}" for name in names]
+    check_poses(poses, of_each)
+    check_no_contradiction(poses, of_each)
     if split == "train" and np.ptp(poses[:, :3, 3], axis=0).max() == 0.0:
         number = "one image" if len(frames) == 1 else f"{len(frames)} images from one place"
         raise InputError(f"{path} has {number}; a scene is seen from two places at least")

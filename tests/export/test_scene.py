@@ -22,6 +22,7 @@ from leco_plugin.export import export, export_folder, in_words
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.city.cameras import look_at
 from leco_plugin.scenes.coloured_points import description_of_run
+from leco_plugin.scenes.frames import APPLIED_EARLIER
 from leco_plugin.scenes.whole_files import write_points
 
 ORIGIN = {"latitude": 42.0, "longitude": -76.0, "altitude": 0.0, "axes": "east, north, up"}
@@ -258,6 +259,14 @@ def test_another_scene_gives_no_colours_and_no_start_for_splats(
         with pytest.raises(ValueError, match="0 of the 3 cameras that the occupancy names are in"):
             export(file, format, tmp_path / out, 16, data=scene)
     assert not export(file, "ply", tmp_path / "k.ply", 16)["photograph_colours"]
+
+
+def test_a_copy_says_what_its_scene_leaves_to_a_folder_beside_it(
+    file: Path, scene: Path, tmp_path: Path
+) -> None:
+    (scene / "colmap/sparse/0").mkdir(parents=True)
+    export(file, "splat-init", tmp_path / "s.json", 16, data=scene)
+    assert json.loads((tmp_path / "s.json").read_text())["applied_transform"] == APPLIED_EARLIER
 
 
 @pytest.mark.parametrize("said", ["", "{", "[1]", '{"frames": null}'])

@@ -19,6 +19,7 @@ from scene_files import change, refused
 
 from leco_plugin.scenes.coloured_points import coloured_points, read_cloud, read_points
 from leco_plugin.scenes.frames import (
+    APPLIED_EARLIER,
     METRES_PER_UNIT,
     POINTS,
     data_frame_of,
@@ -157,6 +158,7 @@ def test_a_sound_scene_passes_as_a_folder_and_as_a_file(scene: Path) -> None:
 
 IN_MILLIMETRES = (1e-3 * np.eye(3, 4)).tolist()
 APPLIED = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.2], [0.0, -1.0, 0.0, 0.0]]
+FOUR_ROWS = [*APPLIED, [0.0, 0.0, 0.0, 1.0]]
 
 
 def earlier(scene: Path) -> None:
@@ -190,6 +192,26 @@ def test_sparse_points_follow_the_cameras_into_model_coordinates(
         distances = torch.cdist(outputs.cameras.camera_to_worlds[:, :, 3], outputs.metadata[POINTS])
         assert len(outputs.metadata[POINTS]) == 9
         assert float(distances.amin(dim=1).max()) < 1e-5
+
+
+@pytest.mark.parametrize(
+    "process",
+    [earlier, lambda scene: change(scene, lambda m: m.update(applied_transform=FOUR_ROWS))],
+    ids=["transformed and not said", "four rows"],
+)
+def test_a_scene_has_one_frame_by_its_folder_and_by_its_file(
+    scene: Path, process: Callable[[Path], object]
+) -> None:
+    process(scene)
+    frames = [
+        parsed_frame(with_checks(config(data=data)).setup().get_dataparser_outputs())
+        for data in (scene, scene / "transforms.json")
+        for config in (LecoPhotographsDataParserConfig, NerfstudioDataParserConfig)
+    ]
+    turn = torch.tensor(APPLIED_EARLIER if process is earlier else FOUR_ROWS)[:3, :3]
+    for frame in frames:
+        torch.testing.assert_close(frame, frames[0])
+        torch.testing.assert_close(frame[:, :3] / frame[:, :3].det() ** (1 / 3), turn.double())
 
 
 def test_a_held_out_stretch_leaves_the_way_back_to_the_file_as_it_is(scene: Path) -> None:

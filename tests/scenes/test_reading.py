@@ -24,6 +24,7 @@ from nerfstudio.data.dataparsers.sdfstudio_dataparser import SDFStudioDataParser
 from PIL import Image
 from scene_files import change, described, refused, write_colmap
 
+from leco_plugin.scenes.frames import POINTS
 from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 from leco_plugin.scenes.reading import read_checked
@@ -394,6 +395,16 @@ NO_CAMERAS: dict[str, tuple[Edit, str]] = {
     "sheared": (set_pose(lambda pose: pose[0, :3].__iadd__(0.2)), "003.* is no rotation: remove"),
     "not finite": (set_pose(lambda pose: pose[0].fill(np.nan)), "003.* is no finite 4 x 4 matrix"),
     "no focal length": (lambda meta: meta.update(fl_x=-1.0), "fl_x is '-1.0'.*positive number"),
+    "in shares": (
+        lambda meta: meta.update(cx=0.5, cy=0.5),
+        "000.*cx is 0.5 and cy is 0.5: give .* in pixels",
+    ),
+    "two poses": (
+        lambda meta: meta["frames"].append(
+            meta["frames"][3] | {"transform_matrix": meta["frames"][4]["transform_matrix"]}
+        ),
+        "003.* is given twice, and differs: remove one",
+    ),
     "no size": (lambda meta: meta["frames"][2].update(w=0), "002.*w is '0'.*positive number"),
     "words": (lambda meta: meta.update(h="high"), "h is 'high'"),
     "another model": (
@@ -543,6 +554,38 @@ def test_pictures_of_colmap_elsewhere_are_named(scene: Path) -> None:
     (scene / "transforms.json").unlink()
     (scene / "images").rename(scene / "input")
     assert "colmap --colmap-path sparse/0 --images-path input` reads" in str(remedy_for(scene))
+
+
+@pytest.mark.parametrize("left", [None, b"", b"# 3D point list\n", b"1 0 0 0 9 9 9 0.5\n"])
+def test_a_model_of_colmap_may_have_no_points(left: bytes | None, scene: Path) -> None:
+    config = as_colmap(scene)
+    file = scene / "sparse/0/points3D.txt"
+    file.unlink() if left is None else file.write_bytes(left)
+    outputs = read(config)
+    assert len(outputs.image_filenames) == 7
+    assert (POINTS in outputs.metadata) == bool(left and left[:1] == b"1")
+    (scene / "sparse/0/points3D.bin").write_bytes(bytes(8))
+    assert POINTS not in read(config).metadata
+    (scene / "sparse/0/points3D.bin").write_bytes(bytes(3))  # cut off
+    with refused(r"mend .*sparse/0$"):
+        read(config)
+
+
+@pytest.mark.parametrize(
+    ("listed", "message"),
+    [
+        (["images/001.png", "002.png"], "train_filenames has 002.png, and no frame has: write"),
+        ("images/001.png", "train_filenames is no list of names"),
+        ([1], "train_filenames is no list of names"),
+    ],
+)
+def test_a_list_that_names_no_frame_is_said(listed: Any, message: str, scene: Path) -> None:
+    change(scene, lambda meta: meta.update(train_filenames=listed))
+    for config in (LecoPhotographsDataParserConfig, NerfstudioDataParserConfig):
+        with refused(message):
+            read(config(data=scene))
+    with refused("downscale_factor is 0; it must be 1 or more"):
+        read(LecoPhotographsDataParserConfig(data=scene, downscale_factor=0))
 
 
 def test_what_colmap_lacks_has_its_own_remedy(scene: Path) -> None:
