@@ -176,6 +176,27 @@ def guide() -> Any:
 
 
 @pytest.fixture
+def printed(capsys: pytest.CaptureFixture[str]) -> Callable[[], str]:
+    """Gives what was printed since it was asked last, as one line of words."""
+    return lambda: " ".join("".join(capsys.readouterr()).split())
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Runs `leco` with arguments that it refuses; returns the one line that it then says."""
+    from leco_plugin import cli
+
+    def line(*arguments: object) -> str:
+        capsys.readouterr()
+        assert cli.main([str(argument) for argument in arguments]) == 2, arguments
+        error = capsys.readouterr().err
+        assert error.startswith("leco: ") and error.count("\n") == 1, error
+        return error
+
+    return line
+
+
+@pytest.fixture
 def run_script(tmp_path: Path) -> Callable[..., str]:
     """Runs a script of `benchmarks` to its end, in a folder of the test; returns what it said."""
     root = Path(__file__).resolve().parent.parent

@@ -67,7 +67,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_what_was_finished_is_kept(
-    taught: Taught, tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    taught: Taught, tiny_scene: Path, tmp_path: Path, printed: Any
 ) -> None:
     out = tmp_path / "capacity"
     arguments = ["capacity", "--data", tiny_scene, "--out", out, "--grids", 16, 32]
@@ -80,7 +80,7 @@ def test_what_was_finished_is_kept(
     results = json.loads((out / "results.json").read_text())
     assert len(results["representations"]) == len(taught)
     assert all(row["code"]["sources"] and row["date"] for row in results["representations"])
-    assert results["verdict"] in capsys.readouterr().out
+    assert results["verdict"] in printed()
     for name in ("capacity.png", "capacity-dark.png"):
         with Image.open(out / name) as image:
             assert image.size[0] > 1000
@@ -134,9 +134,7 @@ def test_a_damaged_file_is_named(
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_grid_that_is_asked_for_twice_is_measured_once(
-    taught: Taught, tiny_scene: Path, tmp_path: Path
-) -> None:
+def test_a_grid_is_measured_once(taught: Taught, tiny_scene: Path, tmp_path: Path) -> None:
     arguments = ["capacity", "--data", tiny_scene, "--out", tmp_path / "out"]
     assert run(*arguments, "--grids", 16, 16) == 0
     assert taught.count("grid-16") == 1
@@ -171,16 +169,12 @@ def test_one_field_teaches_gates_and_grids(
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_grid_that_does_not_fit_the_memory_is_left_out_and_said(
-    taught: Taught,
-    tiny_scene: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    taught: Taught, tiny_scene: Path, tmp_path: Path, printed: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(measuring, "fits_memory", lambda cells: cells < 20**3)
     out = tmp_path / "out"
     assert run("capacity", "--data", tiny_scene, "--out", out, "--grids", 8, 16, 32) == 0
-    said = " ".join(capsys.readouterr().out.split())
+    said = printed()
     assert "a grid of 32^3 cells does not fit the free memory" in said
     rows = json.loads((out / "results.json").read_text())["representations"]
     assert [row["size"] for row in rows if row["family"] == "grid"] == ["8", "16"]

@@ -14,9 +14,7 @@ from leco_plugin.scenes.city.city import CityConfig
 from leco_plugin.scenes.city.folder import write_city
 
 
-def test_whoever_goes_on_is_taught_and_measured_on_the_same_rays(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_resuming_has_the_same_rays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also whoever has learned the field, with rays to sparse points, and whatever was drawn
     between."""
     capture = CaptureConfig(24, 18, aerial_per_block=12.0, street_per_block=0.0)

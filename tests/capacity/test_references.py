@@ -36,9 +36,7 @@ def lost_at(occupancy: Occupancy, evidence: Evidence, threshold: float) -> float
 
 
 @pytest.mark.parametrize("part", [0.3, 0.7])
-def test_it_is_shrunk_at_the_largest_threshold_that_loses_no_more_than_a_smaller_gate_may(
-    part: float,
-) -> None:
+def test_the_threshold_is_the_largest_within_the_bound(part: float) -> None:
     here = on_its_boundary()
     searched = here.references[1].search.evidence
     allowed = part * lost_at(here.original, searched, here.original.threshold)

@@ -102,9 +102,7 @@ def test_what_fails_on_unseen_rays_is_not_chosen() -> None:
     assert [rung.verdict for rung in found.rungs] == ["fails on unseen rays"]
 
 
-def test_each_look_at_the_unseen_rays_is_counted_and_allowed_less(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_each_look_at_unseen_rays_widens_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(searching, "LONGER", 1)
     known = original()
     unseen = known_worth(known, 2)

@@ -71,7 +71,7 @@ Shrinks = Callable[..., Shrunk]
 def shrunk(
     tiny_scene: Path,
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    printed: Any,
     monkeypatch: pytest.MonkeyPatch,
 ) -> Shrinks:
     """Shrinks a file of the tiny scene, with gates of this size if any are given."""
@@ -83,13 +83,13 @@ def shrunk(
         arguments = ["--data", tiny_scene, "--out", out, "--json", tmp_path / "new" / "small.json"]
         assert run("shrink", file, *arguments, *options) == 0
         results = json.loads((tmp_path / "new" / "small.json").read_text())
-        return Shrunk(results, Occupancy.load(out), out, " ".join(capsys.readouterr().out.split()))
+        return Shrunk(results, Occupancy.load(out), out, printed())
 
     return shrink_it
 
 
 def test_without_a_run_it_keeps_to_the_decisions_and_says_so(
-    ball: Path, tmp_path: Path, shrunk: Shrinks, capsys: pytest.CaptureFixture[str]
+    ball: Path, tmp_path: Path, shrunk: Shrinks, printed: Any
 ) -> None:
     smallest = [GateConfig(EncodingConfig(octaves=2), width, 1, 1) for width in (1, 12, 24)]
     picture, bound = tmp_path / "new" / "a.png", ("--lost-surface-mass", 0.2)
@@ -108,7 +108,7 @@ def test_without_a_run_it_keeps_to_the_decisions_and_says_so(
     unknown = ("lost_surface_mass", "lost_mass", "image_price_db")
     assert [smaller.report[name] for name in unknown] == [None] * 3
     assert prices(smaller.report) == {}
-    assert run("inspect", out) == 0 and "lost_decisions: " in capsys.readouterr().out
+    assert run("inspect", out) == 0 and "lost_decisions: " in printed()
     again = shrunk(out, [], *bound).smaller
     assert again.report["lost_decisions"] == pytest.approx(beyond)
     assert describe(smaller)["kept_share_of_box"] == pytest.approx(
@@ -139,9 +139,7 @@ def test_a_search_that_is_stopped_leaves_the_gates_that_it_tried(
     assert "to" not in known and not out.exists()
 
 
-def test_where_nothing_smaller_holds_the_same_gate_is_stored(
-    ball: Path, tmp_path: Path, shrunk: Shrinks
-) -> None:
+def test_where_none_holds_the_same_is_stored(ball: Path, tmp_path: Path, shrunk: Shrinks) -> None:
     original = Occupancy.load(ball)
     original.precision = "bfloat16"
     original.save(ball)
@@ -193,9 +191,7 @@ def test_bad_input_ends_with_one_line_and_status_2(
     assert not (tmp_path / "out.safetensors").exists() and ball.read_bytes() == before
 
 
-def test_the_speed_is_by_how_much_the_smaller_one_is_faster(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_smaller_gate_answers_faster(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("leco_plugin.capacity.shrink.TIMED_POSITIONS", 1 << 14)
     small = ball_of_the_tiny_scene()
     large = Gate(GateConfig(EncodingConfig(octaves=8), 256, 4, 1))
@@ -205,9 +201,7 @@ def test_the_speed_is_by_how_much_the_smaller_one_is_faster(
     assert compare_queries(small, slow)[0] < 0.5
 
 
-def test_the_model_of_the_run_says_what_is_lost(
-    file: Path, tiny_scene: Path, shrunk: Shrinks
-) -> None:
+def test_the_runs_model_says_what_is_lost(file: Path, tiny_scene: Path, shrunk: Shrinks) -> None:
     original = Occupancy.load(file)
     assert original.threshold > 0.0
     bounds = ("--lost-surface-mass", 0.25, "--image-price", 0.5)
@@ -326,9 +320,7 @@ def test_what_is_declared_holds_against_the_field_at_the_moment_of_freezing(
         assert part.evidence.rays == references.RAYS > sum(len(one.truth) for one in part.rendered)
 
 
-def test_a_field_that_renders_nothing_is_no_reference(
-    known: tuple[sources.Source, Occupancy],
-) -> None:
+def test_an_empty_field_is_no_reference(known: tuple[sources.Source, Occupancy]) -> None:
     source, original = known
     assert source.model is not None
     with torch.no_grad():

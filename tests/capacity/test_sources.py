@@ -30,9 +30,7 @@ from leco_plugin.scenes.input_error import InputError
 Known = tuple[Source, Occupancy]
 
 
-def test_of_a_guided_hosts_run_only_the_decisions_are_asked(
-    tiny_scene: Path, tmp_path: Path
-) -> None:
+def test_a_guided_run_has_no_model_to_ask(tiny_scene: Path, tmp_path: Path) -> None:
     from leco_plugin.host_configs import leco_ngp
 
     config: Any = copy.deepcopy(leco_ngp.config)
@@ -68,9 +66,7 @@ def test_another_scene_than_the_runs_is_refused(
         check_scene(find_source(file, other), original, other)
 
 
-def test_cameras_are_compared_in_the_coordinates_of_the_occupancy(
-    tiny_scene: Path, tmp_path: Path
-) -> None:
+def test_cameras_are_compared_in_its_coordinates(tiny_scene: Path, tmp_path: Path) -> None:
     known = ball_of_the_tiny_scene()
     known.report["cameras"] = [
         tiny_scene_writer.camera_to_world(2 * torch.pi * i / 9)[:3, 3].tolist() for i in range(9)

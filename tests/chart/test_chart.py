@@ -108,9 +108,7 @@ def test_stopping_ends_the_runs_beside_and_none_of_them_is_a_failure(chart: Char
 
 
 @pytest.mark.parametrize("stops_at", range(6))
-def test_after_a_kill_only_what_is_missing_is_made(
-    chart: Charts, tmp_path: Path, stops_at: int
-) -> None:
+def test_a_killed_chart_makes_what_is_missing(chart: Charts, tmp_path: Path, stops_at: int) -> None:
     first = Runner(stops_at)
     with pytest.raises(KeyboardInterrupt):
         make(chart(), first)
@@ -137,9 +135,7 @@ def test_a_run_that_was_too_short_to_learn_says_so(chart: Charts) -> None:
     ]
 
 
-def test_a_crash_is_a_row_the_others_finish_and_it_is_tried_again(
-    chart: Charts, tmp_path: Path
-) -> None:
+def test_a_crash_is_a_row_and_is_tried_again(chart: Charts, tmp_path: Path) -> None:
     said = make(chart(), Runner(broken="b")).said
     results = json.loads((tmp_path / "results.json").read_text())
     assert [run["name"] for run in results["runs"]] == ["a", "a", "c", "c"]
@@ -177,9 +173,7 @@ def test_results_have_the_agreed_form(chart: Charts, tiny_scene: Path) -> None:
     assert {"date", "commit", "version"} <= results["made"].keys()
 
 
-def test_commands_and_commits_are_all_those_that_made_what_is_shown(
-    chart: Charts, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_all_commands_and_commits_are_named(chart: Charts, monkeypatch: pytest.MonkeyPatch) -> None:
     parts = ["leco chart --methods a", "leco chart --methods b"]
     for command, commit, one in zip(parts, ("1b", "2a"), CONTENDERS):
         code = {"version": "0.1.0", "commit": commit}
@@ -239,9 +233,7 @@ WITH_GRIDS = replace(PLAIN, name="ours", grids=(64, 128))
 OTHER = Contender("other", "leco-occupancy", "dense")
 
 
-def test_what_another_chart_has_is_not_made_again_and_bears_the_name_it_has_here(
-    chart: Charts, tmp_path: Path
-) -> None:
+def test_runs_of_another_chart_take_the_names_of_this_one(chart: Charts, tmp_path: Path) -> None:
     make(chart("a", contenders=[PLAIN], command="leco chart --suite a"))
     named, others = replace(PLAIN, name="identity (ours)"), [tmp_path / "a"]
     suite = ("losses", "What?")
@@ -264,9 +256,7 @@ def test_other_settings_of_the_method_are_another_run(chart: Charts, tmp_path: P
     assert made.runs == [("learn", 2)]
 
 
-def test_a_run_with_grids_is_also_the_one_without_and_not_the_other_way_round(
-    chart: Charts, tmp_path: Path
-) -> None:
+def test_a_run_with_grids_serves_a_chart_without_them(chart: Charts, tmp_path: Path) -> None:
     make(chart("grids", contenders=[WITH_GRIDS]))
     results, made, _ = make(chart("plain", contenders=[PLAIN], reuse=[tmp_path / "grids"]))
     assert not made
@@ -302,9 +292,7 @@ def test_a_chart_with_other_settings_gives_no_runs(chart: Charts, tmp_path: Path
     assert not (tmp_path / "b").exists()
 
 
-def test_charts_that_fit_are_found_among_folders_that_may_hold_none(
-    chart: Charts, tmp_path: Path
-) -> None:
+def test_only_charts_of_the_same_settings_are_shared(chart: Charts, tmp_path: Path) -> None:
     long, beside = Protocol(11.0), Protocol(10.0, at_once=2)
     for name, protocol in (("a", Protocol(10.0)), ("long", long), ("beside", beside)):
         make(chart(name, contenders=[PLAIN], seeds=(0,), protocol=protocol))

@@ -20,9 +20,11 @@ from leco_plugin.chart.methods import AT_ONCE, SUITES
 from leco_plugin.chart.runner import UNFINISHED, ProcessRunner, RunFailed
 from leco_plugin.scenes.locks import alone_in
 
-METHODS = ["--methods", "leco-occupancy", "leco-occupancy-never-frozen"]
+ONE = ["--methods", "leco-occupancy"]
+METHODS = [*ONE, "leco-occupancy-never-frozen"]
 TIME = ["--seconds", 3]
 Started = list[tuple[str, int]]
+Run = Callable[..., int]
 
 
 @pytest.fixture
@@ -51,19 +53,22 @@ def not_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Chart, "draw", Chart.write)
 
 
-def run(*arguments: object) -> int:
-    return cli.main(["chart", *(str(argument) for argument in arguments)])
+@pytest.fixture
+def run(tiny_scene: Path, tmp_path: Path) -> Run:
+    """Runs `leco chart` on the tiny scene, into the folder `chart` or another one; its status."""
+
+    def chart(*arguments: object, out: str = "chart") -> int:
+        words = ["chart", "--data", tiny_scene, "--out", tmp_path / out, *arguments]
+        return cli.main([str(word) for word in words])
+
+    return chart
 
 
-def test_a_crash_half_way_is_a_row_the_others_finish_and_the_status_is_one(
-    started: Started,
-    tiny_scene: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+def test_a_crash_is_a_row_the_others_finish_and_the_status_is_one(
+    started: Started, run: Run, tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "chart"
-    arguments = ["--data", tiny_scene, "--out", out, *METHODS, *TIME, "--seeds", 0, 1]
+    arguments = [*METHODS, *TIME, "--seeds", 0, 1]
     assert run(*arguments) == 1
     assert len(started) == 4
     row = "| LeCO, never frozen | 1 | failed: half-way there was no memory left |"
@@ -77,75 +82,57 @@ def test_a_crash_half_way_is_a_row_the_others_finish_and_the_status_is_one(
     assert run(*arguments) == 1 and len(started) == 6  # only what crashed is made again
 
 
-@pytest.mark.usefixtures("not_drawn")
-def test_how_long_it_takes_is_said_before_it_is_started(
-    started: Started,
-    tiny_scene: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    out = ["--data", tiny_scene, "--out", tmp_path / "chart", "--methods", "leco-occupancy"]
-    assert run(*out, "--seconds", 75, "--seeds", 0, 1) == 0
-    assert "2 runs of 75 s, about 4 minutes on two CPU cores" in capsys.readouterr().out
-    assert run(*out, "--seconds", 75, "--seeds", 0, 1, 2) == 0
-    said = capsys.readouterr().out
-    assert "1 run of 75 s, about 2 minutes on two CPU cores (2 more are there" in said
-    steps = ["--data", tiny_scene, "--out", tmp_path / "steps", "--methods", "leco-occupancy"]
-    assert run(*steps, "--steps", 9, "--seeds", 0) == 0
-    assert "1 run of 9 steps, about 1 minute on" in capsys.readouterr().out
-    beside = ["--data", tiny_scene, "--out", tmp_path / "beside", "--methods", "leco-occupancy"]
-    assert run(*beside, "--seconds", 75, "--at-once", 2) == 0
-    assert "3 runs of 75 s, 2 at a time, about 3 minutes on" in capsys.readouterr().out
+@pytest.mark.usefixtures("not_drawn", "started")
+def test_how_long_it_takes_is_said_before_it_is_started(run: Run, printed: Any) -> None:
+    for out, words, said in (
+        ("a", ["--seconds", 75, "--seeds", 0, 1], "2 runs of 75 s, about 4 minutes on two CPU"),
+        ("a", ["--seconds", 75, "--seeds", 0, 1, 2], "1 run of 75 s, about 2 minutes on two CPU"),
+        ("steps", ["--steps", 9, "--seeds", 0], "1 run of 9 steps, about 1 minute on"),
+        ("beside", ["--seconds", 75, "--at-once", 2], "3 runs of 75 s, 2 at a time, about 3 min"),
+    ):
+        assert run(*ONE, *words, out=out) == 0
+        found = printed()
+        assert said in found and ("cores (2 more are there" in found) == ("1 run of 75" in said)
 
 
 @pytest.mark.usefixtures("not_drawn")
-def test_while_a_chart_is_made_a_second_process_in_its_folder_is_refused_in_one_line(
-    started: Started,
-    tiny_scene: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+def test_a_second_process_in_the_folder_of_a_chart_is_refused(
+    started: Started, run: Run, refused: Any, tiny_scene: Path, tmp_path: Path
 ) -> None:
-    out = tmp_path / "out"
-    arguments = ["--data", tiny_scene, "--out", out, "--methods", "leco-occupancy", *TIME]
-    assert run(*arguments, "--seeds", 0) == 0
+    out, arguments = tmp_path / "chart", [*ONE, *TIME, "--seeds"]
+    assert run(*arguments, 0) == 0
     under_way = out / UNFINISHED / "a-run"
     under_way.mkdir()
     with alone_in(out, "chart"):
-        capsys.readouterr()
-        assert run(*arguments, "--seeds", 0, 1) == 2
-    error = capsys.readouterr().err
-    assert "another process makes the chart in" in error and error.count("\n") == 1
+        error = refused("chart", "--data", tiny_scene, "--out", out, *arguments, 0, 1)
+    assert "another process makes the chart in" in error
     assert len(started) == 1 and under_way.exists()
-    assert run(*arguments, "--seeds", 0, 1) == 0 and len(started) == 2
+    assert run(*arguments, 0, 1) == 0 and len(started) == 2
 
 
 @pytest.mark.usefixtures("not_drawn")
-def test_several_suites_have_a_folder_each_and_none_makes_what_another_has_made(
-    started: Started, tiny_scene: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "charts"
-    arguments = ["--data", tiny_scene, "--out", out, "--seeds", 0]
+def test_suites_have_folders_and_share_runs(started: Started, run: Run, tmp_path: Path) -> None:
     names = ["losses", "empty-expert", "representations"]
-    assert run(*arguments, "--suite", *names, "--json", tmp_path / "all.json") == 0
+    assert run("--seeds", 0, "--suite", *names, "--json", tmp_path / "all.json") == 0
     shown = {name: {one.name for one in SUITES[name].contenders} for name in names}
     stored = json.loads((tmp_path / "all.json").read_text())["charts"]
     for name in names:
         assert {one["name"] for one in stored[name]["runs"]} == shown[name]
-        assert stored[name] == json.loads((out / name / "results.json").read_text())
+        results = tmp_path / "chart" / name / "results.json"
+        assert stored[name] == json.loads(results.read_text())
         words = stored[name]["made"]["command"]
         assert f"--suite {name} --steps" in words and f"--at-once {AT_ONCE}" in words
     keys = {one.alone().key for name in names for one in SUITES[name].contenders}
     assert len(started) == len(keys)
-    assert run(*arguments, "--suite", *names) == 0 and len(started) == len(keys)
-    assert run(*arguments, "--suite", "freeze", "losses", "--seconds", 7) == 2  # losses had steps
+    assert run("--seeds", 0, "--suite", *names) == 0
+    assert run("--seeds", 0, "--suite", "freeze", "losses", "--seconds", 7) == 2  # losses had steps
     assert len(started) == len(keys)
 
 
 @pytest.mark.usefixtures("not_drawn")
-def test_all_suites_are_every_suite(started: Started, tiny_scene: Path, tmp_path: Path) -> None:
-    out = tmp_path / "charts"
-    assert run("--data", tiny_scene, "--out", out, "--suite", "all", "--seeds", 0) == 1
-    assert {path.name for path in out.iterdir()} == set(SUITES)
+def test_all_suites_are_every_suite(started: Started, run: Run, tmp_path: Path) -> None:
+    assert run("--suite", "all", "--seeds", 0) == 1
+    assert {path.name for path in (tmp_path / "chart").iterdir()} == set(SUITES)
     crashing = {("never frozen", 0), ("equal experts, no gate", 0)}  # as this stand-in has it
     assert crashing <= set(started) and len(started) == len(set(started))
 
@@ -155,33 +142,32 @@ def test_runs_beside_each_other_share_the_threads_of_the_machine(
 ) -> None:
     machine = {"cpu": "x", "cores": 8, "threads": 8, "device": "cpu"}
     monkeypatch.setattr("leco_plugin.chart.chart.describe_machine", lambda: dict(machine))
-    threads = {}
-    for at_once in (1, 2, 16):
-        protocol = Protocol(1.0, at_once=at_once)
-        one = SUITES["losses"].contenders[0]
+    for at_once, threads, variable in (
+        (1, 8, os.environ.get("OMP_NUM_THREADS")),
+        (2, 4, "4"),
+        (16, 1, "1"),
+    ):
+        protocol, one = Protocol(1.0, at_once=at_once), SUITES["losses"].contenders[0]
         made = Chart(tiny_scene, tmp_path / str(at_once), [one], (0,), protocol)
         runner = command.processes(made)
         assert isinstance(runner, ProcessRunner) and runner.stop is made.stop
-        threads[at_once] = made.machine["threads"], runner.environment.get("OMP_NUM_THREADS")
-    assert threads[2] == (4, "4") and threads[16] == (1, "1")
-    assert threads[1] == (8, os.environ.get("OMP_NUM_THREADS"))
+        assert made.machine["threads"] == threads
+        assert runner.environment.get("OMP_NUM_THREADS") == variable
 
 
 @pytest.mark.usefixtures("not_drawn")
 def test_the_stored_command_makes_the_same_runs(
-    started: Started, tiny_scene: Path, tmp_path: Path
+    started: Started, run: Run, tiny_scene: Path, tmp_path: Path
 ) -> None:
     chosen = [*METHODS, *TIME, "--seeds", 4, 5, "--images", 1, "--learn-seconds", 2]
-    assert run("--data", tiny_scene, "--out", tmp_path / "first", *chosen) == 1
+    assert run(*chosen, out="first") == 1
     stored = json.loads((tmp_path / "first" / "results.json").read_text())["made"]["command"]
     words = stored.split()
     assert words[:4] == ["leco", "chart", "--data", tiny_scene.name]
-    assert run("--data", tiny_scene, "--out", tmp_path / "again", *words[4:]) == 1
+    assert run(*words[4:], out="again") == 1
     assert started[:4] == started[4:] and len(started) == 8
-    settings = [
-        json.loads((tmp_path / name / "settings.json").read_text()) for name in ("first", "again")
-    ]
-    assert settings[0] == settings[1]
+    settings = [(tmp_path / name / "settings.json").read_text() for name in ("first", "again")]
+    assert json.loads(settings[0]) == json.loads(settings[1])
 
 
 BAD = {
@@ -205,44 +191,34 @@ BAD = {
 
 @pytest.mark.parametrize("cause", BAD)
 def test_bad_input_is_one_line_and_nothing_is_started(
-    cause: str,
-    started: Started,
-    tiny_scene: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    cause: str, started: Started, refused: Any, tiny_scene: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "chart"
-    assert run("--data", tiny_scene, "--out", out, *BAD[cause]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("leco: ") and said.count("\n") == 1 and cause in said, said
+    assert cause in refused("chart", "--data", tiny_scene, "--out", out, *BAD[cause])
     assert not started and not out.exists()
 
 
 def test_folders_and_scenes_that_do_not_fit_are_one_line_too(
-    started: Started, tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    started: Started, run: Run, refused: Any, tiny_scene: Path, tmp_path: Path
 ) -> None:
-    good, taken = tmp_path / "good", tmp_path / "taken"
-    assert run("--data", tiny_scene, "--out", good, "--suite", "losses", "--seeds", 0) == 0
+    good, taken, new = (tmp_path / name for name in ("good", "taken", "new"))
+    assert run("--suite", "losses", "--seeds", 0, out="good") == 0
     begun = len(started)
     assert begun == len(SUITES["losses"].contenders)
     taken.mkdir()
     (taken / "thesis.txt").write_text("")
     before = sorted(str(path) for path in good.rglob("*"))
-    capsys.readouterr()
-    scene, new = ["--data", tiny_scene], ["--out", tmp_path / "new"]
-    cases: dict[str, list[object]] = {
-        "another suite": [*scene, "--out", good, *METHODS, *TIME],
-        "another seconds": [*scene, "--out", good, "--suite", "losses", "--seconds", 7],
-        "holds something else": [*scene, "--out", taken, *METHODS, *TIME],
-        "else (thesis.txt)": [*scene, "--out", taken, "--suite", "losses", "freeze"],
-        "else (chart-dark.png)": [*scene, "--out", good, "--suite", "all"],
-        "thesis.txt": [*scene, "--out", taken / "thesis.txt", *METHODS, *TIME],
-        "nowhere": ["--data", tmp_path / "nowhere", *new, *METHODS, *TIME],
-    }
-    for cause, arguments in cases.items():
-        assert run(*arguments) == 2, cause
-        said = capsys.readouterr().err
-        assert said.startswith("leco: ") and said.count("\n") == 1 and cause in said, said
-    assert len(started) == begun and not (tmp_path / "new").exists()
+    for cause, out, arguments in (
+        ("another suite", good, [*METHODS, *TIME]),
+        ("another seconds", good, ["--suite", "losses", "--seconds", 7]),
+        ("holds something else", taken, [*METHODS, *TIME]),
+        ("else (thesis.txt)", taken, ["--suite", "losses", "freeze"]),
+        ("else (chart-dark.png)", good, ["--suite", "all"]),
+        ("thesis.txt", taken / "thesis.txt", [*METHODS, *TIME]),
+        ("nowhere", new, [*METHODS, *TIME]),
+    ):
+        data = tmp_path / "nowhere" if out is new else tiny_scene
+        assert cause in refused("chart", "--data", data, "--out", out, *arguments)
+    assert len(started) == begun and not new.exists()
     assert sorted(str(path) for path in good.rglob("*")) == before
     assert [path.name for path in taken.iterdir()] == ["thesis.txt"]

@@ -95,9 +95,7 @@ def test_everything_else_is(change: dict[str, object]) -> None:
         (["NGP + a"], ["NGP + a"]),
     ],
 )
-def test_a_method_that_all_share_is_left_out_of_their_names(
-    names: list[str], short: list[str]
-) -> None:
+def test_short_names_leave_out_a_shared_method(names: list[str], short: list[str]) -> None:
     assert short_names(names) == short
 
 
@@ -154,9 +152,7 @@ def test_every_contender_is_tested_on_the_photographs_that_are_asked_for() -> No
         assert reader.held_out == "spread"
 
 
-def test_a_method_with_a_reader_of_its_own_holds_out_no_stretch(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_only_our_reader_holds_out_a_stretch(monkeypatch: pytest.MonkeyPatch) -> None:
     data = replace(leco_ngp.config.pipeline.datamanager, dataparser=BlenderDataParserConfig())
     config = replace(
         leco_ngp.config,

@@ -49,9 +49,7 @@ def make(scene: Path, out: Path, pace: str) -> Chart:
     return chart
 
 
-def test_a_killed_chart_loses_only_the_run_that_was_under_way(
-    tiny_scene: Path, tmp_path: Path
-) -> None:
+def test_a_killed_chart_loses_only_the_run_under_way(tiny_scene: Path, tmp_path: Path) -> None:
     out, here = tmp_path / "chart", Path(__file__).resolve().parent
     found = os.environ.get("PYTHONPATH", "")
     paths = {**os.environ, "PYTHONPATH": f"{here}:{here.parent}:{found}"}

@@ -174,9 +174,7 @@ def test_what_is_asked_for_twice_is_made_once() -> None:
         (["leco-occupancy-retrained"], ["dense"], "it has learned-occupancy"),
     ],
 )
-def test_what_fits_nothing_is_refused_in_a_line(
-    methods: list[str], samplers: list[str], said: str
-) -> None:
+def test_unknown_choices_are_refused(methods: list[str], samplers: list[str], said: str) -> None:
     with pytest.raises(InputError, match=said) as refused:
         contenders(methods, samplers)
     assert "\n" not in str(refused.value)

@@ -32,9 +32,7 @@ def boxes_of(axes: Any) -> Boxes:
 
 @settings(deadline=None, max_examples=25)
 @given(st.lists(st.tuples(*[st.floats(0.05, 0.95)] * 2), min_size=2, max_size=6))
-def test_names_of_points_lie_in_the_panel_and_not_on_one_another(
-    places: list[tuple[float, float]],
-) -> None:
+def test_names_of_points_do_not_overlap(places: list[tuple[float, float]]) -> None:
     axes = panel()
     names = [f"the name {i}" for i in range(len(places))]
     name_points(axes, places, names, ["black"] * len(places))

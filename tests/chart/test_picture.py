@@ -37,9 +37,7 @@ def share_of(colour: str, path: Path) -> float:
 
 
 @pytest.mark.parametrize("theme", [LIGHT, DARK], ids=["light", "dark"])
-def test_every_contender_is_seen_in_its_colour_on_the_themes_page(
-    theme: Theme, tmp_path: Path
-) -> None:
+def test_every_contender_is_drawn_in_its_colour(theme: Theme, tmp_path: Path) -> None:
     path = draw(results(*RUNS), tmp_path / "chart.png", theme)
     assert share_of(theme.page, path) > 0.5
     assert all(share_of(colour, path) > 1e-3 for colour in theme.colours[:2])
@@ -170,9 +168,7 @@ def test_a_chart_without_occupancies_has_no_row_for_them(tmp_path: Path) -> None
     assert "volume kept at equal loss" not in text
 
 
-def test_a_grid_without_a_learning_time_stands_where_sizes_are_compared_alone(
-    tmp_path: Path,
-) -> None:
+def test_a_grid_without_a_learning_time_is_drawn_by_size_only(tmp_path: Path) -> None:
     ours = run("MLP", occupancy=occupancy(50_000, 0.1, [grid(64, 0.3)]))
     text = figure_text(write_page(results(ours), tmp_path / "chart.html"))
     ours, of_grid = text.count('"text":["MLP"]'), text.count('"text":["grid 64')

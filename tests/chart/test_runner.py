@@ -82,9 +82,7 @@ def test_an_empty_folder_is_taken(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["{", "[]", "\\x00"])
-def test_a_damaged_folder_is_told_of_in_a_line_that_names_the_file(
-    tmp_path: Path, text: str
-) -> None:
+def test_a_damaged_file_is_named(tmp_path: Path, text: str) -> None:
     folder = RunFolder(tmp_path, SETTINGS)
     run = folder.path / RUNS / "a.json"
     run.write_text(text)
@@ -127,9 +125,7 @@ def folder(tmp_path: Path) -> RunFolder:
     return RunFolder(tmp_path / "chart", {})
 
 
-def test_a_result_comes_back_with_its_occupancy_and_nothing_is_left_behind(
-    folder: RunFolder,
-) -> None:
+def test_a_result_comes_back_with_its_occupancy(folder: RunFolder) -> None:
     shares: list[float] = []
     result = runner(folder, SUCCEEDS)(JOB, shares.append)
     assert result == {"psnr": 20.0, "seed": 3}
@@ -140,9 +136,7 @@ def test_a_result_comes_back_with_its_occupancy_and_nothing_is_left_behind(
 
 
 @pytest.mark.parametrize("reason", FAILURES)
-def test_a_process_that_fails_has_a_reason_in_a_line_and_keeps_its_log(
-    folder: RunFolder, reason: str
-) -> None:
+def test_a_process_that_fails_gives_its_reason(folder: RunFolder, reason: str) -> None:
     with pytest.raises(RunFailed, match=reason) as failed:
         runner(folder, FAILURES[reason])(JOB, lambda share: None)
     assert "\n" not in str(failed.value)

@@ -194,9 +194,7 @@ def test_small_gates_are_taught_by_the_field_as_it_was_and_stand_beside(
     assert json.loads(json.dumps(result)) == result
 
 
-def test_a_run_that_starts_anew_when_frozen_has_no_field_to_measure(
-    tiny_scene: Path, tmp_path: Path
-) -> None:
+def test_a_restarted_run_has_no_field_to_measure(tiny_scene: Path, tmp_path: Path) -> None:
     one = replace(ONE, changes={**SMALL, "schedule.restart": True})
     found = run_job(one, 0, tiny_scene, SHORT, tmp_path)
     assert found["occupancy"]["at_equal_loss"] is None and found["steps"] == 6
@@ -242,18 +240,14 @@ def smaller(one: Contender) -> Contender:
         for key, one in CONTENDERS.items()
     ],
 )
-def test_every_contender_of_every_suite_can_be_trained(
-    one: Contender, tiny_scene: Path, tmp_path: Path
-) -> None:
+def test_every_contender_can_be_trained(one: Contender, tiny_scene: Path, tmp_path: Path) -> None:
     short = Protocol(steps=6, images=1, curve_points=1)
     run = run_job(smaller(one), 0, tiny_scene, short, tmp_path)
     assert run["steps"] == 6 and run["psnr"] > 0.0
     assert (run["occupancy"] is not None) == one.sampler.startswith("learned-occupancy")
 
 
-def test_what_is_measured_at_freezing_is_the_gate_of_then_and_no_small_one(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_at_freezing_the_large_gate_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     mixture = small_mixture()
     at_freezing = worker._weights_of(mixture)
     small, head = Gate(GateConfig(width=8, layers=1)), mixture.gate.head.bias.detach().clone()

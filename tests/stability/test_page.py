@@ -35,9 +35,7 @@ def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_the_page_shows_the_stored_table_and_says_where_its_runs_come_from(
-    results: Path, tmp_path: Path
-) -> None:
+def test_the_page_shows_the_stored_table(results: Path, tmp_path: Path) -> None:
     import stability_page
 
     empty = stability_page.page(PAGE.read_text(), results)

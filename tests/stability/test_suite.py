@@ -97,9 +97,7 @@ def test_a_folder_of_other_sizes_is_refused(tmp_path: Path) -> None:
         suite_module.Suite(tmp_path, cases_named(("yard",)), samplers_named(()), (0,), longer)
 
 
-def test_a_folder_is_gone_on_with_on_fewer_cores(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fewer_cores_go_on_in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make(suite(tmp_path, ("yard",), ("grid-128",)), Runs())
     fewer = suite_module.describe_machine() | {"cores": 1, "threads": 7}
     monkeypatch.setattr(suite_module, "describe_machine", lambda: fewer)
@@ -114,17 +112,13 @@ def test_the_time_it_takes_is_said_before_and_from_its_own_runs_later(tmp_path: 
     assert more.estimate() == "3 of 6 runs are to be made, 1 at a time: about 30 s"
 
 
-def test_no_more_runs_than_there_are_are_made_at_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_one_run_is_made_by_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(suite_module, "usable_cores", lambda: 64)
     made = suite(tmp_path, ("yard",), ("dense",))
     assert made.estimate() == "1 of 1 run is to be made, 1 at a time: about 2 min"
 
 
-def test_runs_on_other_pictures_are_not_gone_on_with(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_pictures_are_another_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The scene's file has the places of its cameras, and not what they see."""
     make(suite(tmp_path, ("yard",), ("dense",)), Runs())
     yard = plan.STAGES["yard"]

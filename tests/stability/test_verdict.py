@@ -33,9 +33,7 @@ DENSE = runs(25.0, 25.1, 24.9)
         ((25.0, 25.0, 23.4), "fail"),
     ],
 )
-def test_the_median_and_the_worst_seed_are_held_to_the_bars(
-    psnrs: tuple[float, ...], verdict: str
-) -> None:
+def test_median_and_worst_seed_are_judged(psnrs: tuple[float, ...], verdict: str) -> None:
     cell = judge(runs(*psnrs), DENSE)
     assert cell.verdict == verdict and bool(cell.reason) == (verdict != "pass")
 

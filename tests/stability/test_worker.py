@@ -98,9 +98,7 @@ def test_a_packed_host_that_skips_half_of_the_scene_loses_its_surfaces(
     assert judge([blind], [dense]).verdict == "fail"
 
 
-def test_the_dense_reference_of_a_proposal_host_samples_everywhere(
-    scene: Path, tmp_path: Path
-) -> None:
+def test_a_dense_proposal_host_samples_everywhere(scene: Path, tmp_path: Path) -> None:
     contender = contender_of(SAMPLERS["dense-proposal"], MICRO, {}, {})
     record = run(contender, scene, tmp_path / "run")
     assert record["measured"]["kept_fraction"] == 1.0

@@ -88,13 +88,13 @@ def full(*_: Any) -> None:
 
 
 def test_a_full_disk_costs_one_checkpoint_and_says_which_one_is_left(
-    trainer: AtomicTrainer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    trainer: AtomicTrainer, monkeypatch: pytest.MonkeyPatch, printed: Any
 ) -> None:
     trainer.save_checkpoint(10)
     with monkeypatch.context() as filling:
         filling.setattr(torch, "save", full)
         trainer.save_checkpoint(20)
-        said = " ".join(capsys.readouterr().out.split())
+        said = printed()
         assert "step 20: no checkpoint could be saved" in said and "No space left" in said
         assert names(trainer.checkpoint_dir) == ["step-000000010.ckpt"]
         trainer.training_state = "completed"
@@ -123,14 +123,12 @@ def test_a_write_that_the_system_cuts_off_costs_one_checkpoint(trainer: AtomicTr
     assert damage_of(trainer.checkpoint_dir / "step-000000010.ckpt") is None
 
 
-def test_weights_that_are_not_finite_are_not_saved(
-    trainer: AtomicTrainer, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_weights_that_are_not_finite_are_not_saved(trainer: AtomicTrainer, printed: Any) -> None:
     trainer.save_checkpoint(10)
     with torch.no_grad():
         trainer.pipeline.bias[0] = torch.nan
     trainer.save_checkpoint(20)
-    assert "bias is not finite" in " ".join(capsys.readouterr().out.split())
+    assert "bias is not finite" in printed()
     assert names(trainer.checkpoint_dir) == ["step-000000010.ckpt"]
 
 
@@ -254,15 +252,15 @@ def test_an_empty_folder_has_no_checkpoint(trainer: AtomicTrainer, tmp_path: Pat
 
 
 def test_kernels_that_are_off_are_said_before_training(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, printed: Any
 ) -> None:
     monkeypatch.setenv(VARIABLE, "march, gate")
     _say_which_kernels_are_off()
-    said = " ".join(capsys.readouterr().out.split())
+    said = printed()
     assert "[leco] LECO_KERNELS_OFF: torch answers in place of gate, march" in said
     monkeypatch.setenv(VARIABLE, "marsh")
     with pytest.raises(InputError, match="LECO_KERNELS_OFF names marsh"):
         _say_which_kernels_are_off()
     monkeypatch.delenv(VARIABLE)
     _say_which_kernels_are_off()
-    assert capsys.readouterr().out == ""
+    assert printed() == ""

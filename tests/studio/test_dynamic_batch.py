@@ -105,17 +105,13 @@ def test_the_batch_follows_the_samples_that_rays_have_within_bounds(
     assert rays_after(pipeline, rays, samples) == then
 
 
-def test_a_first_batch_beyond_the_bounds_is_brought_within(
-    tiny_scene: Path, tmp_path: Path
-) -> None:
+def test_the_first_batch_keeps_to_the_bounds(tiny_scene: Path, tmp_path: Path) -> None:
     pipeline = pipeline_of(config(tiny_scene, tmp_path, fewest_rays=2 * FIRST))
     assert pipeline.dynamic_num_rays_per_batch == 2 * FIRST
     assert len(pipeline.datamanager.next_train(0)[0]) == 2 * FIRST
 
 
-def test_the_fake_sample_of_an_empty_batch_is_not_taken_for_one(
-    tiny_scene: Path, tmp_path: Path
-) -> None:
+def test_the_fake_sample_of_an_empty_batch_is_ignored(tiny_scene: Path, tmp_path: Path) -> None:
     made = config(tiny_scene, tmp_path)
     occupancy(1.0, "box").save(made.pipeline.model.occupancy.path)
     pipeline = pipeline_of(made)
@@ -127,9 +123,7 @@ def test_the_fake_sample_of_an_empty_batch_is_not_taken_for_one(
     assert pipeline.dynamic_num_rays_per_batch == FIRST * TARGET
 
 
-def test_a_batch_of_nothing_but_backdrops_grows_no_faster_than_any(
-    tiny_scene: Path, tmp_path: Path
-) -> None:
+def test_a_batch_of_backdrops_grows_no_faster(tiny_scene: Path, tmp_path: Path) -> None:
     pipeline = pipeline_of(config(tiny_scene, tmp_path, threshold=1.0))
     _, _, metrics = pipeline.get_train_loss_dict(0)
     assert int(metrics["num_samples_per_batch"]) == FIRST  # one a ray
@@ -179,9 +173,7 @@ class TheirPipelineConfig(DynamicBatchPipelineConfig):
     theirs: int = 7
 
 
-def test_a_pipeline_of_another_package_keeps_its_class_and_is_clamped_too(
-    tiny_scene: Path, tmp_path: Path
-) -> None:
+def test_a_pipeline_of_another_package_is_clamped_too(tiny_scene: Path, tmp_path: Path) -> None:
     made = config(tiny_scene, tmp_path).pipeline
     theirs = clamped(
         TheirPipelineConfig(

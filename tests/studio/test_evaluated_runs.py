@@ -44,11 +44,9 @@ def loaded(folder: Path, step: int | None = None) -> tuple[Path, int]:
     return from_whole(lambda config, _: (config.load_dir, config.load_step))(config, None)
 
 
-def test_a_whole_run_is_evaluated_from_its_newest(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_whole_run_loads_its_newest(folder: Path, printed: Any) -> None:
     assert loaded(folder) == (folder, 20)
-    assert capsys.readouterr().out == ""
+    assert printed() == ""
 
 
 def test_without_a_whole_checkpoint_one_line_names_the_files_and_what_to_do(folder: Path) -> None:

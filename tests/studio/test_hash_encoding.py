@@ -176,9 +176,7 @@ NERFACTO = NerfactoModelConfig(implementation="torch", log2_hashmap_size=8, num_
         (NERFACTO, "dense-proposal", 1),
     ],
 )
-def test_every_encoding_of_a_host_is_sped_up_and_keeps_its_names(
-    host: ModelConfig, sampler: str, encodings: int
-) -> None:
+def test_encodings_of_a_host_keep_names(host: ModelConfig, sampler: str, encodings: int) -> None:
     config = GuidedModelConfig(host=host, occupancy=OccupancyConfig(sampler=sampler))
     model = config.setup(**what_a_model_gets())
     found = [module for module in model.modules() if isinstance(module, HashEncoding)]

@@ -10,9 +10,7 @@ import pytest
 from leco_plugin.studio.trainer import HEARD, catch_first_interrupt
 
 
-def test_the_first_ctrl_c_is_noted_and_the_second_one_interrupts(
-    capfd: pytest.CaptureFixture[str],
-) -> None:
+def test_the_second_ctrl_c_interrupts(capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(KeyboardInterrupt), catch_first_interrupt() as asked:
         assert not asked.is_set()
         signal.raise_signal(signal.SIGINT)

@@ -40,9 +40,7 @@ def raised(line: str) -> ProcessRaisedException:
         (raised("RuntimeError: [..] Connection closed by peer [::1]:7"), "one of 2 processes"),
     ],
 )
-def test_a_lost_process_is_named_with_what_is_left(
-    error: Exception, message: str, tmp_path: Path
-) -> None:
+def test_a_lost_process_is_named(error: Exception, message: str, tmp_path: Path) -> None:
     with pytest.raises(TrainingStopped, match=f"{message}.*; no checkpoint was saved yet"):
         launching(error)(config=config_of(tmp_path))
     (tmp_path / "step-000000007.ckpt").touch()

@@ -37,14 +37,14 @@ def config_of(project: Path) -> Path:
 
 
 def test_a_run_is_found_beside_its_config_and_its_data_where_they_lay(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    trained: Path, tmp_path: Path, printed: Any
 ) -> None:
     project = Path(shutil.copytree(trained, tmp_path / "project"))
     loaded: tuple[Any, ...] = eval_utils.eval_setup(config_of(project))
     _, pipeline, checkpoint, step = loaded
     assert step == 7 and checkpoint.parent == config_of(project).parent / "nerfstudio_models"
     assert pipeline.datamanager.get_datapath() == project / "data" / "scene"
-    assert "data/scene is not there;" in " ".join(capsys.readouterr().out.split())
+    assert "data/scene is not there;" in printed()
 
 
 @pytest.mark.parametrize("linked", [False, True])
@@ -66,9 +66,7 @@ def test_what_the_error_asks_for_is_enough(trained: Path, tmp_path: Path, linked
         eval_utils.eval_setup(run / "config.yml")
 
 
-def test_data_that_a_command_names_are_read_although_the_old_ones_are_gone(
-    trained: Path, tmp_path: Path
-) -> None:
+def test_data_that_a_command_names_are_read(trained: Path, tmp_path: Path) -> None:
     run = Path(shutil.copytree(config_of(trained).parent, tmp_path / "run"))
     scene = Path(shutil.copytree(trained / "data" / "scene", tmp_path / "elsewhere" / "photos"))
 
@@ -85,9 +83,7 @@ def test_data_that_a_command_names_are_read_although_the_old_ones_are_gone(
         eval_utils.eval_setup(run / "config.yml", update_config_callback=named_by_command)
 
 
-def test_neither_runs_on_the_data_nor_another_scenes_file_are_taken_for_them(
-    tmp_path: Path,
-) -> None:
+def test_runs_and_files_of_other_scenes_are_not_taken_for_data(tmp_path: Path) -> None:
     run = tmp_path / "outputs" / "exp2" / "leco-ngp" / "b"
     other = tmp_path / "outputs" / "caliterra" / "leco-ngp" / "a"
     for folder in (run, other):
@@ -108,9 +104,7 @@ def test_neither_runs_on_the_data_nor_another_scenes_file_are_taken_for_them(
     assert found_around(file, run) == tmp_path / "siteA" / "transforms.json"
 
 
-def test_the_longest_part_of_a_path_that_is_there_is_taken_and_no_folder_of_the_run(
-    tmp_path: Path,
-) -> None:
+def test_the_longest_part_of_a_path_that_exists_is_taken(tmp_path: Path) -> None:
     run = tmp_path / "outputs" / "scene" / "method" / "run"
     run.mkdir(parents=True)
     assert found_around(Path("/gone/data/scene"), run) is None

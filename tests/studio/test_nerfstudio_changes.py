@@ -76,9 +76,7 @@ def test_a_run_ends_where_its_trainer_stops(installed: type[Trainer], from_zero:
         assert end_of(again) == again.step + 1 == 90
 
 
-def test_without_its_source_nerfstudio_is_taken_for_the_release(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_without_its_source_it_is_the_release(monkeypatch: pytest.MonkeyPatch) -> None:
     counts_from_zero.cache_clear()
     monkeypatch.setattr(nerfstudio_changes, "Trainer", SimpleNamespace(train=len))
     assert not counts_from_zero()
@@ -111,9 +109,7 @@ def test_ctrl_c_asks_for_the_steps_that_are_left(
 
 @BOTH
 @pytest.mark.usefixtures("installed")
-def test_a_resumed_run_without_a_step_left_is_refused(
-    from_zero: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_without_steps_is_refused(from_zero: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """nerfstudio would save its checkpoint as that of step 0."""
     trainer = resumed(AtomicTrainer, 30)
     trainer.callbacks, trainer.pipeline = [], SimpleNamespace(model=None)

@@ -62,9 +62,7 @@ def draw(monkeypatch: pytest.MonkeyPatch, model: Any, bundle: RayBundle) -> dict
         return model(bundle)
 
 
-def test_a_host_is_drawn_at_the_sliders_threshold_and_goes_on_with_its_own(
-    host: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_slider_changes_what_is_drawn_only(host: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     bundle = bundle_of(*rays())
     own = host(bundle)["samples"]
     assert draw(monkeypatch, host, bundle)["samples"] == own > 0
@@ -133,9 +131,7 @@ def test_a_slider_that_nobody_has_moved_follows_the_run() -> None:
     assert (view.calibrated.value, view.chosen()) == ("0.2", 0.8)
 
 
-def test_the_overlay_tells_kept_from_skipped_and_from_unseen(
-    host: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_overlay_colours_what_is_kept(host: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     known = copy.deepcopy(ball())
     half_seen = Occupancy(known.gate, known.space, 0.5, report=known.report)
     half_seen.seen.cells[:, 32:] = False  # beyond the middle in y

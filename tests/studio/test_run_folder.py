@@ -6,6 +6,7 @@ import copy
 import os
 import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
 from forked_commands import ForkedCommands
@@ -66,9 +67,7 @@ def test_a_run_that_ends_by_itself_leaves_no_lock_and_one_that_has_it_keeps_it(
     assert list(folder.iterdir()) == []
 
 
-def test_a_lock_that_is_taken_away_while_it_is_opened_is_made_anew(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_lock_that_goes_away_is_made_anew(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder.mkdir()
     flock, opened = locks.fcntl.flock, []
 
@@ -86,9 +85,7 @@ def test_a_lock_that_is_taken_away_while_it_is_opened_is_made_anew(
     os.close(held)
 
 
-def test_a_lock_is_held_where_files_are_never_the_same(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_lock_holds_on_odd_file_systems(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder.mkdir()
     monkeypatch.setattr(locks, "_lies_in", lambda *_: False)
     held = locks.lock(folder)
@@ -103,9 +100,7 @@ def test_a_folder_in_which_nothing_can_be_written_is_said_in_one_line(folder: Pa
         claim(beneath, beneath / "checkpoints", None)
 
 
-def test_a_full_disk_is_said_in_one_line_before_the_run(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_is_said_before_the_run(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object, **__: object) -> int:
         raise OSError(28, "No space left on device")
 
@@ -128,9 +123,7 @@ def test_a_new_run_does_not_take_a_folder_with_checkpoints(folder: Path) -> None
     assert claim(folder, checkpoints, left) is None
 
 
-def test_a_config_goes_to_a_folder_of_its_own_and_says_so(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_config_goes_to_a_folder_of_its_own_and_says_so(tmp_path: Path, printed: Any) -> None:
     def config():
         made = copy.deepcopy(leco_occupancy.config)
         made.output_dir, made.experiment_name, made.timestamp = tmp_path, "tiny", "run"
@@ -145,6 +138,6 @@ def test_a_config_goes_to_a_folder_of_its_own_and_says_so(
     second = config()
     assert second.timestamp == "run-2" and (second.get_base_dir() / "config.yml").exists()
     assert (first.get_base_dir() / "config.yml").read_text() == before
-    assert "this run goes to" in " ".join(capsys.readouterr().out.split())
+    assert "this run goes to" in printed()
     for made in (first, second):
         release(made.get_base_dir())

@@ -128,7 +128,7 @@ def resumed(begun: Any, scene: Path, name: str) -> Any:
 
 
 def test_a_resumed_run_has_the_sizes_it_was_begun_with(
-    begun: Any, scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    begun: Any, scene: Path, monkeypatch: pytest.MonkeyPatch, printed: Any
 ) -> None:
     def lost(*_: Any) -> Any:
         raise AssertionError("sizes are chosen anew")
@@ -137,7 +137,7 @@ def test_a_resumed_run_has_the_sizes_it_was_begun_with(
     trainer = run(resumed(begun, scene, "resumed"))
     assert trainer.pipeline.model.config.sizes == begun.pipeline.model.config.sizes
     assert trainer.step == 2 * STEPS - 1
-    assert "texels" not in capsys.readouterr().out
+    assert "texels" not in printed()
     stored = yaml.load(
         (trainer.config.get_base_dir() / "config.yml").read_text(), Loader=yaml.Loader
     )
@@ -151,9 +151,7 @@ def groups_of(optimizer: torch.optim.Optimizer) -> list[torch.Tensor]:
     return [parameter for group in optimizer.param_groups for parameter in group["params"]]
 
 
-def test_another_size_or_other_photographs_are_refused_in_one_line(
-    begun: Any, scene: Path, poorer: Path
-) -> None:
+def test_other_sizes_or_photographs_are_refused(begun: Any, scene: Path, poorer: Path) -> None:
     config = resumed(begun, scene, "other")
     with pytest.raises(InputError, match=r"with 7 training photographs, and the scene has 6"):
         config.setup(local_rank=0, world_size=1).setup()

@@ -86,16 +86,14 @@ class Viewer:
         self.drawn += 1
 
 
-def test_a_viewer_stays_open_as_long_as_somebody_is_looking(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_viewer_stays_open_while_a_page_is(printed: Any) -> None:
     viewer = Viewer(2, 1, 1, 0)
     stay_open(viewer)
     assert viewer.viser_server.pages == [] and viewer.drawn == 1
-    assert "stays open" in capsys.readouterr().out
+    assert "stays open" in printed()
 
 
-def test_a_viewer_closes_at_once_where_nobody_is(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_viewer_closes_at_once_where_nobody_is(printed: Any) -> None:
     stay_open(Viewer(0))
     stay_open(None)
-    assert capsys.readouterr().out == ""
+    assert printed() == ""
