@@ -115,9 +115,7 @@ def test_grids_are_measured_like_the_gate(mixture: Mixture) -> None:
     assert even["update_seconds"] > 0.0
 
 
-def test_a_coarse_grid_hears_of_a_surface_that_random_places_miss(
-    mixture: Mixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_coarse_grid_keeps_a_thin_film(mixture: Mixture, monkeypatch: pytest.MonkeyPatch) -> None:
     def film(mapped: Tensor, *_: Tensor) -> tuple[Tensor, Tensor]:
         on_film = (mapped[:, 0] - 0.2).abs() < 1e-4
         return 1e5 * on_film, torch.zeros(len(mapped), 4)
@@ -136,9 +134,7 @@ def test_a_coarse_grid_hears_of_a_surface_that_random_places_miss(
     assert row["kept_reached_volume"] < 0.2  # a slab of one cell, not the whole box
 
 
-def test_space_that_no_ray_reaches_is_nobodys_volume(
-    mixture: Mixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unreached_space_is_not_counted(mixture: Mixture, monkeypatch: pytest.MonkeyPatch) -> None:
     everywhere = equal_loss.candidates_of(mixture, None)
     middles = (everywhere[:, 0] > -6 / 32) & (everywhere[:, 0] < 3 / 32)  # nine layers of cells
     seen = everywhere[middles]
@@ -150,7 +146,7 @@ def test_space_that_no_ray_reaches_is_nobodys_volume(
     assert found["grids"][0]["kept_reached_volume"] == pytest.approx(1 / 3, abs=0.01)
 
 
-def test_what_is_measured_is_the_weight_near_surfaces_before_the_backdrop(
+def test_weights_of_surfaces_are_measured(
     mixture: Mixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     intervals = Intervals(torch.zeros(3).long(), torch.arange(3.0), torch.arange(1.0, 4.0))
@@ -163,7 +159,7 @@ def test_what_is_measured_is_the_weight_near_surfaces_before_the_backdrop(
     torch.testing.assert_close(found, [torch.tensor([0.0, 0.3]), torch.tensor([0.1, 0.6])])
 
 
-def test_rays_without_any_surface_are_refused_in_a_line(
+def test_rays_without_a_surface_are_refused(
     mixture: Mixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     nothing = torch.zeros(0, 3), torch.zeros(0), torch.zeros(0)

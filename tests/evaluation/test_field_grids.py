@@ -40,13 +40,8 @@ def test_a_cell_has_the_density_of_the_place() -> None:
 
 
 def test_outside_the_box_there_is_nothing() -> None:
-    scores = torch.ones(4, 4, 4)
-    assert look_up_scores(
-        scores, BOX, torch.tensor([[0.0, 0.0, 0.6], [0.0, 0.0, 0.4]])
-    ).tolist() == [
-        0,
-        1,
-    ]
+    places = torch.tensor([[0.0, 0.0, 0.6], [0.0, 0.0, 0.4]])
+    assert look_up_scores(torch.ones(4, 4, 4), BOX, places).tolist() == [0, 1]
 
 
 def test_refining_finds_what_asking_every_cell_finds_with_fewer_questions() -> None:
@@ -127,13 +122,15 @@ def test_known_places_count_like_a_loop_over_them() -> None:
     torch.testing.assert_close(found, expected)
 
 
-def test_a_fine_grid_is_reached_by_halves() -> None:
-    assert halvings(32, 0) == [32]
-    assert halvings(64, 32) == [64]
-    assert halvings(512, 0) == [64, 128, 256, 512]
-    assert halvings(512, 128) == [256, 512]
-    assert halvings(100, 0) == [50, 100]
-    assert halvings(75, 50) == [75]
+@pytest.mark.parametrize(
+    ("cells", "known", "steps"),
+    [
+        *((32, 0, [32]), (64, 32, [64]), (512, 0, [64, 128, 256, 512]), (512, 128, [256, 512])),
+        *((100, 0, [50, 100]), (75, 50, [75])),
+    ],
+)
+def test_a_fine_grid_is_reached_by_halves(cells: int, known: int, steps: list[int]) -> None:
+    assert halvings(cells, known) == steps
 
 
 def test_a_grid_serves_the_next_one_only_if_that_is_twice_as_fine() -> None:
@@ -178,10 +175,6 @@ def test_an_octree_takes_what_its_nodes_take_one_after_another(share: float) -> 
     kept = coarse.repeat_interleave(4, 0).repeat_interleave(4, 1).repeat_interleave(4, 2)
     kept |= torch.rand(16, 16, 16) < share / 10.0
     assert octree_bytes(kept) == node_bytes(kept)
-
-
-def test_an_octree_of_cells_that_are_no_power_of_two_is_that_of_the_next() -> None:
-    kept = torch.rand(5, 5, 5) < 0.3
-    padded = torch.zeros(8, 8, 8, dtype=torch.bool)
-    padded[:5, :5, :5] = kept
-    assert octree_bytes(kept) == octree_bytes(padded) == node_bytes(padded) > 0
+    few, padded = torch.rand(5, 5, 5) < 0.3, torch.zeros(8, 8, 8, dtype=torch.bool)
+    padded[:5, :5, :5] = few  # as of the next power of two
+    assert octree_bytes(few) == octree_bytes(padded) == node_bytes(padded) > 0

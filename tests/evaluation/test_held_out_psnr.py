@@ -92,9 +92,7 @@ def test_at_the_end_test_photographs_are_looked_at() -> None:
     assert HeldOutPsnr(host, SimpleNamespace(train_dataset=host)).look_at_tests() is None
 
 
-def test_drawing_the_pixels_is_counted_as_time_that_measuring_takes(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_drawing_pixels_is_part_of_the_time_spent(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock()
 
     def draw(_: Any, count: int, share: str) -> tuple[torch.Tensor, torch.Tensor]:

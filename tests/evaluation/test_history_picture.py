@@ -36,9 +36,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_a_film_that_a_full_disk_cuts_off_replaces_no_older_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_leaves_the_older_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def cut_off(_: Image.Image, target: Any, *__: Any, **___: Any) -> None:
         with nullcontext(target) if hasattr(target, "write") else Path(target).open("wb") as out:
             out.write(b"half")
@@ -86,9 +84,7 @@ def test_a_colour_is_the_same_in_every_frame_of_a_film(tmp_path: Path) -> None:
         assert max(abs(a - b) for a, b in zip(wanted, seen)) <= 8
 
 
-def test_a_long_history_is_shown_from_its_first_look_to_its_last(
-    run: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_long_history_is_shown_evenly(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert spread_evenly(3, 16) == [0, 1, 2] and spread_evenly(1, 16) == [0]
     shown = spread_evenly(200, 16)
     assert (shown[0], shown[-1], len(shown)) == (0, 199, 16)

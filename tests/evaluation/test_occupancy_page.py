@@ -63,9 +63,7 @@ def test_a_page_without_a_scene_is_coloured_by_height(tmp_path: Path) -> None:
     assert "kept, height" in text and "no photograph shows it" not in text
 
 
-def test_the_ground_under_slices_has_the_colours_of_what_is_seen_from_above(
-    colours: SceneColours,
-) -> None:
+def test_slices_lie_on_the_colours_seen_from_above(colours: SceneColours) -> None:
     box = whole_box(ball())
     seen = seen_from_above(ball(), box, colours)
     y, x = torch.meshgrid(box.axis(1, len(seen)), box.axis(0, seen.shape[1]), indexing="ij")

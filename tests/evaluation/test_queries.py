@@ -96,19 +96,15 @@ def test_proposal_networks_are_counted_apart() -> None:
     assert queries == {"field": 35, "proposal": 48, "learning": 0, "gate": 0}
 
 
-def test_a_field_that_asks_its_parent_class_is_asked_once() -> None:
-    host = Host(ThickFog())
+def test_a_field_that_asks_its_parent_class_or_is_called_is_asked_once() -> None:
+    host, called = Host(ThickFog()), Host(Plain())
     host.other = Fog()  # type: ignore[assignment]
     with count_queries(host) as queries:
         host.field.density_fn(torch.zeros(9, 3))
     assert queries["field"] == 9
-
-
-def test_a_field_that_is_called_is_counted() -> None:
-    host = Host(Plain())
-    with count_queries(host) as queries:
-        host.field(torch.zeros(13, 3), noise=1.0)
-        host.field(torch.zeros(4, 6, 3))
+    with count_queries(called) as queries:
+        called.field(torch.zeros(13, 3), noise=1.0)
+        called.field(torch.zeros(4, 6, 3))
     assert queries["field"] == 13 + 24
 
 
@@ -153,9 +149,7 @@ def ball_density(positions: torch.Tensor) -> torch.Tensor:
     ("step", "said", "warming_up"),
     [(255, {}, True), (256, {}, False), (63, {"warmup_steps": 64}, True)],
 )
-def test_the_warm_up_is_what_the_host_says_and_else_that_of_the_grid(
-    step: int, said: dict[str, Any], warming_up: bool
-) -> None:
+def test_the_host_says_how_long_it_warms(step: int, said: dict[str, Any], warming_up: bool) -> None:
     host = GridHost()
     updates = GridUpdates(host)
     assert updates.grids == [host.grid] and updates.warming_up is None
@@ -182,13 +176,9 @@ def test_updates_are_made_and_their_time_is_counted() -> None:
     host = GridHost()
     updates = GridUpdates(host)
     host.grid.update_every_n_steps(0, ball_density)
-    assert 0 < int(host.grid.binaries.sum()) < 512
-    assert updates.clock.seconds > 0.0
-
-
-def test_a_model_without_a_grid_says_nothing() -> None:
-    updates = GridUpdates(torch.nn.Linear(2, 2))
-    assert updates.grids == [] and updates.warming_up is None and updates.clock.seconds == 0.0
+    assert 0 < int(host.grid.binaries.sum()) < 512 and updates.clock.seconds > 0.0
+    nothing = GridUpdates(torch.nn.Linear(2, 2))
+    assert nothing.grids == [] and nothing.warming_up is None and nothing.clock.seconds == 0.0
 
 
 def test_a_grid_that_does_not_say_when_it_is_warm_is_updated_all_the_same() -> None:

@@ -207,9 +207,7 @@ def test_figures_are_means_over_test_pictures_and_only_rendering_is_timed(
     assert found["render_seconds_per_image"] == middle
 
 
-def test_a_figure_that_one_picture_lacks_has_no_mean(
-    time: Time, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_figure_that_is_missing_has_no_mean(time: Time, monkeypatch: pytest.MonkeyPatch) -> None:
     """As LPIPS of a small picture among larger ones."""
     lpips = iter(({"lpips": 0.4}, {}, {"lpips": 0.2}))
     monkeypatch.setattr(module, "image_metrics", lambda *_: {"psnr": 20.0, **next(lpips)})
@@ -294,13 +292,16 @@ class Run:
         return timed_run(config, budget, sampler="s", curve_points=2, images=0)[0]
 
 
-def test_learning_an_occupancy_is_training_time_and_looking_is_not(
-    time: Time, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def a_run(time: Time, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Run]:
+    return lambda model, *seconds: Run(time, model, list(seconds), monkeypatch)
+
+
+def test_learning_counts_as_time_and_looks_do_not(a_run: Callable[..., Run], time: Time) -> None:
     host = nn.Module()
     host.leco_guide = nn.Module()
     host.leco_guide.occupancy = None
-    run = Run(time, host, [1.0, 1.0, 1.0, 1.0, 5.0, 1.0, 1.0], monkeypatch)
+    run = a_run(host, 1.0, 1.0, 1.0, 1.0, 5.0, 1.0, 1.0)
 
     def learn_first(step: int) -> None:
         if step == 0:
@@ -325,90 +326,62 @@ def test_points_of_a_curve_that_are_no_number_are_left_out() -> None:
     assert record.to_dict()["curve"] == [[2.0, 20.0]]
 
 
-def test_a_run_that_ends_without_a_number_has_diverged(
-    time: Time, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run = Run(time, nn.Module(), [40.0], monkeypatch)
+def test_a_run_without_a_number_has_diverged(a_run: Callable[..., Run]) -> None:
+    run = a_run(nn.Module(), 40.0)
     run.psnrs = iter((math.nan,))
     with pytest.raises(FloatingPointError, match="it has diverged"):
         run.record()
 
 
-def test_a_scene_without_test_images_is_refused_before_the_training(
-    time: Time, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run = Run(time, nn.Module(), [40.0], monkeypatch)
+def test_a_scene_without_tests_is_refused_first(a_run: Callable[..., Run], time: Time) -> None:
+    run = a_run(nn.Module(), 40.0)
     run.trainer.pipeline.datamanager.eval_dataset = []
     with pytest.raises(InputError, match="no test image"):
         run.record()
     assert time.now == 100.0
 
 
-def learning_model() -> Any:
-    """A model that learns its occupancy itself, not frozen yet."""
+ENDLESS = module.ENDLESS
+
+
+@pytest.mark.parametrize(
+    ("recent", "frozen_after", "seconds", "ends"),
+    [
+        # nothing is known before the fourth step, which leaves 11 s for steps of 2 s each, nor when
+        # the gate learns again
+        (None, range(2, 5), (9, 9, 9, 2, 4, 4, 3), [*[ENDLESS] * 4, 4 + 6, 5 + 3, ENDLESS]),
+        # 33 s and 27 s are left for steps of 6 s, 23 s for those of 5, then 19 s and 15 s for those
+        # of 4, and 6 s for those of 6.5
+        (2, range(9), (1, 6, 6, 4, 4, 4, 9, 9), [*[ENDLESS] * 2, 8, 8, 9, 10, 10, 8]),
+        (None, range(3, 9), (9, 9, 9, 9, 2, 1, 1), None),
+    ],
+    ids=["while it is frozen", "by the latest steps", "after freezing"],
+)
+def test_a_model_that_learns_itself_knows_its_last_step(
+    recent: int | None, frozen_after: range, seconds: Any, ends: Any, a_run: Any, monkeypatch: Any
+) -> None:
+    monkeypatch.setattr(module, "RECENT", recent or module.RECENT)
     model: Any = nn.Module()
     model.mixture = nn.Module()
     model.mixture.field, model.mixture.frozen = Fog(), False
-    return model
-
-
-def test_a_step_is_timed_once_there_is_an_occupancy(
-    time: Time, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    model = learning_model()
-    run = Run(time, model, [9.0, 9.0, 9.0, 9.0, 2.0, 1.0, 1.0], monkeypatch)
+    run, found = a_run(model, *map(float, seconds)), []
 
     def freeze(step: int) -> None:
-        model.mixture.frozen = step >= 3
+        found.append(run.trainer.config.max_num_iterations)
+        model.mixture.frozen = step in frozen_after
 
     run.ends = freeze
     record = run.record()
-    assert (record.freeze_seconds, record.step_seconds, record.steps) == (36.0, 1.0, 7)
+    assert ends is None or found == ends
+    assert record.steps == len(seconds)
+    if ends is None:
+        assert (record.freeze_seconds, record.step_seconds) == (36.0, 1.0)
 
 
-def test_a_model_that_learns_itself_knows_how_many_steps_are_left_of_its_time(
-    time: Time, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    model = learning_model()
-    run = Run(time, model, [9.0, 9.0, 9.0, 2.0, 4.0, 4.0, 3.0], monkeypatch)
-    ends = []
-
-    def freeze(step: int) -> None:
-        ends.append(run.trainer.config.max_num_iterations)
-        model.mixture.frozen = 2 <= step < 5
-
-    run.ends = freeze
-    assert run.record().steps == 7
-    # nothing is known before the fourth step, which leaves 11 s for steps of 2 s each, nor when the
-    # gate learns again
-    assert ends == [module.ENDLESS] * 4 + [4 + 6, 5 + 3, module.ENDLESS]
-
-
-def test_the_steps_left_are_foreseen_by_the_latest_ones(
-    time: Time, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "RECENT", 2)
-    model = learning_model()
-    run = Run(time, model, [1.0, 6.0, 6.0, 4.0, 4.0, 4.0, 9.0, 9.0], monkeypatch)
-    ends = []
-
-    def freeze(step: int) -> None:
-        ends.append(run.trainer.config.max_num_iterations)
-        model.mixture.frozen = True
-
-    run.ends = freeze
-    run.record()
-    # 33 s and 27 s are left for steps of 6 s, 23 s for those of 5, then 19 s and 15 s for those of
-    # 4, and 6 s for those of 6.5
-    assert ends == [module.ENDLESS] * 2 + [2 + 6, 3 + 5, 4 + 5, 5 + 5, 6 + 4, 7 + 1]
-
-
-def test_updates_of_a_grid_are_its_learning_time(
-    time: Time, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_updates_of_a_grid_are_learning_time(a_run: Callable[..., Run], time: Time) -> None:
     host = nn.Module()
     host.grid = Grid(time)
-    run = Run(time, host, [18.0, 18.0], monkeypatch)
+    run = a_run(host, 18.0, 18.0)
     run.begins = lambda step: host.grid.update_every_n_steps(step=step)
     record = run.record()
     assert (record.train_seconds, record.learn_seconds) == (40.0, 4.0)
@@ -416,9 +389,7 @@ def test_updates_of_a_grid_are_its_learning_time(
 
 
 @pytest.mark.parametrize("seed", [0, 3])
-def test_a_seed_decides_all_random_numbers_of_a_run(
-    seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_seed_decides_all_random_numbers(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[float] = []
 
     def draw() -> None:
