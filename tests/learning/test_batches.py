@@ -52,7 +52,7 @@ def test_only_a_gate_that_is_being_learned_leaves_out_what_it_calls_empty(frozen
 @pytest.mark.parametrize(
     ("empty_fraction", "factor"), [(0.0, 0.5), (0.75, 2.0), (0.875, 4.0), (0.999, 4.0)]
 )
-def test_a_guided_batch_has_the_samples_of_a_learning_one_within_limits(
+def test_a_guided_batch_has_as_many_samples(
     made: Any, empty_fraction: float, factor: float
 ) -> None:
     made.learner.mixture.freeze(0.5, {"empty_fraction": empty_fraction})
@@ -61,9 +61,7 @@ def test_a_guided_batch_has_the_samples_of_a_learning_one_within_limits(
 
 
 @pytest.mark.parametrize(("kept", "rays"), [(1.0, 100), (0.5, 200), (0.4, 250), (0.1, 400)])
-def test_while_learning_the_rays_follow_what_is_shaded_in_eighths(
-    made: Any, kept: float, rays: int
-) -> None:
+def test_while_learning_rays_follow_what_is_shaded(made: Any, kept: float, rays: int) -> None:
     made.progress.learning_kept = kept
     made.learner.before_step(0)
     made.learner.before_step(1)
@@ -90,7 +88,7 @@ def test_a_gate_that_is_never_frozen_is_not_followed_once_it_has_learned(made: A
 @pytest.mark.parametrize(
     ("step", "weight", "wanted"), [(0, 0.03, True), (7, 0.03, False), (0, 0.0, False)]
 )
-def test_known_distances_are_asked_for_only_while_learning_with_a_weight(
+def test_distances_are_for_learning_alone(
     made: Any, step: int, weight: float, wanted: bool
 ) -> None:
     made.learner.data.sparse = points = object()

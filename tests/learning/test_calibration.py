@@ -105,9 +105,7 @@ def test_a_backdrop_that_the_gate_calls_empty_is_neither_skipped_nor_lost() -> N
     mass=st.sampled_from([1e-4, 1e-2, 0.2]),
     price=st.sampled_from([0.01, 0.1, 1.0]),
 )
-def test_the_threshold_is_the_largest_within_the_bounds(
-    seed: int, mass: float, price: float
-) -> None:
+def test_the_threshold_is_the_largest_that_fits(seed: int, mass: float, price: float) -> None:
     problem, config = Problem(seed), CalibrationConfig(mass, price)
     found = calibrate(problem.rendering(), config)
     fitting = [t for t in THRESHOLDS if measure(problem.rendering(), t).within(config)]
@@ -117,9 +115,7 @@ def test_the_threshold_is_the_largest_within_the_bounds(
 
 @pytest.mark.parametrize("share", [0.3, 0.9, 1.5])
 @pytest.mark.parametrize("seed", range(4))
-def test_what_was_spent_and_what_is_spent_now_are_held_to_one_bound(
-    seed: int, share: float
-) -> None:
+def test_earlier_and_new_costs_share_one_bound(seed: int, share: float) -> None:
     """A small gate skips on top of a learned one, so that each may not spend all of it."""
     rendering, config = Problem(seed).rendering(), CalibrationConfig(0.05, 0.5)
     spent = Measured(0.5, share * 0.05, 0.01, share * 0.5, 0.5, 0.004, 0.03)._asdict()
@@ -140,23 +136,35 @@ def test_what_was_spent_and_what_is_spent_now_are_held_to_one_bound(
     assert found.threshold <= calibrate(rendering, config).threshold
 
 
-def test_a_price_that_nobody_knows_was_not_spent() -> None:
+def test_a_price_that_nobody_knows_was_not_spent_and_one_that_is_no_number_stays_none() -> None:
     """A report of another program may say null for a price."""
     found = Measured(0.5, 1e-4, 1e-3, 0.02, 0.5, 1e-5, 1e-3)
     known = found.on_top_of({"lost_surface_mass": 2e-4, "image_price_db": None})
     assert known.lost_surface_mass == pytest.approx(3e-4)
     assert known.image_price_db == 0.02
+    costs = Measured(0.5, math.nan, 0.1, math.nan, 0.5).on_top_of({"image_price_db": 0.01})
+    assert math.isnan(costs.image_price_db) and math.isnan(costs.lost_surface_mass)
+    assert costs.lost_mass == 0.1
 
 
-def test_what_a_photograph_has_lost_so_far_counts_against_its_bound() -> None:
+def test_no_photograph_that_vouches_loses_more_than_its_bound() -> None:
+    """What it has lost so far counts too."""
     problem, config = Problem(0), CalibrationConfig(0.05, 1.0)
     cameras = [Chunk(seed).reference for seed in (12, 13, 17, 25, 36, 39, 42, 43, 44)]
     alone = calibrate(problem.rendering(), config)
     lower = THRESHOLDS[THRESHOLDS.index(alone.threshold) + 1]
-    allowed = worst_loss(cameras, alone.threshold)
+    bound, allowed = (worst_loss(cameras, one) for one in (lower, alone.threshold))
+    assert allowed > bound > config.camera_surface_mass
+    narrow = replace(config, camera_surface_mass=bound)
+    found = calibrate(problem.rendering(), narrow, cameras=cameras)
+    assert found == measure(problem.rendering(), lower)
+    promised = promise(cameras, found, narrow)
+    assert promised["worst_surface_mass"] == promised["bound"] == bound
+    assert (promised["count"], promised["confidence"]) == (9, 0.9)
+
     config = replace(config, camera_surface_mass=allowed)
     assert calibrate(problem.rendering(), config, cameras=cameras) == alone
-    earlier = allowed - worst_loss(cameras, lower)
+    earlier = allowed - bound
     spent = {CAMERAS_THAT_VOUCH: {"worst_surface_mass": earlier}}
     assert calibrate(problem.rendering(), config, cameras=cameras, spent=spent).threshold == lower
     promised = promise(cameras, alone, config, spent)
@@ -164,25 +172,8 @@ def test_what_a_photograph_has_lost_so_far_counts_against_its_bound() -> None:
     assert promise(cameras, measure(problem.rendering(), 0.0), config, spent)["bound"] == allowed
     assert promised["confidence"] == 0.8  # both thresholds were chosen by the same nine
     beyond = {CAMERAS_THAT_VOUCH: {"worst_surface_mass": 2.0 * allowed}}
-    config = replace(config, camera_surface_mass=worst_loss(cameras, lower))
-    found = calibrate(problem.rendering(), config, cameras=cameras, spent=beyond)
-    assert found == calibrate(problem.rendering(), config, cameras=cameras)
-    assert found.threshold == lower  # a view that is lost already does not give up the others
-
-
-def test_no_photograph_that_vouches_loses_more_than_its_bound() -> None:
-    problem, config = Problem(0), CalibrationConfig(0.05, 1.0)
-    cameras = [Chunk(seed).reference for seed in (12, 13, 17, 25, 36, 39, 42, 43, 44)]
-    alone = calibrate(problem.rendering(), config)
-    lower = THRESHOLDS[THRESHOLDS.index(alone.threshold) + 1]
-    bound = worst_loss(cameras, lower)
-    assert worst_loss(cameras, alone.threshold) > bound > config.camera_surface_mass
-    config = replace(config, camera_surface_mass=bound)
-    found = calibrate(problem.rendering(), config, cameras=cameras)
-    assert found == measure(problem.rendering(), lower)
-    promised = promise(cameras, found, config)
-    assert promised["worst_surface_mass"] == promised["bound"] == bound
-    assert (promised["count"], promised["confidence"]) == (9, 0.9)
+    # a view that is lost already does not give up the others
+    assert calibrate(problem.rendering(), narrow, cameras=cameras, spent=beyond) == found
 
 
 def test_a_view_that_no_threshold_does_justice_to_lowers_nothing_and_is_said() -> None:
@@ -196,22 +187,16 @@ def test_a_view_that_no_threshold_does_justice_to_lowers_nothing_and_is_said() -
 
 
 @pytest.mark.parametrize(("more", "followed"), [(24, True), (26, False)])
-def test_photographs_that_vouch_may_keep_a_quarter_more_candidates(
-    more: int, followed: bool
-) -> None:
+def test_vouching_photographs_keep_a_quarter_more(more: int, followed: bool) -> None:
     """A hundred candidates are kept for the held-out ray, and some more for the photograph."""
     occupancies = torch.tensor([1.0] * 100 + [0.2] * more + [0.0] * 300)
-    ray_indices = torch.zeros(len(occupancies), dtype=torch.int64)
-    starts, grey, never = (
-        torch.arange(len(occupancies)) * 1.0,
-        torch.full((1, 3), 0.5),
-        occupancies < 0,
-    )
+    ray_indices, starts = torch.zeros(len(occupancies)).long(), torch.arange(len(occupancies)) * 1.0
+    grey, intervals = torch.full((1, 3), 0.5), Intervals(ray_indices, starts, starts + 1.0)
 
     def seen_at(occupancy: float) -> Reference:
-        there = occupancies == occupancy
-        intervals = Intervals(ray_indices, starts, starts + 1.0)
-        return Reference(intervals, there.float() / there.sum(), occupancies, there, grey, never)
+        there, weights = occupancies == occupancy, (occupancies == occupancy).float()
+        never = occupancies < 0
+        return Reference(intervals, weights / there.sum(), occupancies, there, grey, never)
 
     ray, photograph = seen_at(1.0), seen_at(0.2)
     rendering = DenseRendering([ray], [grey], lambda number, mask: grey)
@@ -235,12 +220,6 @@ def test_a_photograph_whose_loss_is_no_number_vouches_for_nothing() -> None:
     assert trusting.threshold == doubting.threshold == THRESHOLDS[0]
     assert not math.isnan(promise([sound], trusting, config)["bound"])
     assert math.isnan(promise([broken], doubting, config)["bound"])
-
-
-def test_a_cost_that_is_no_number_is_not_taken_for_none() -> None:
-    costs = Measured(0.5, math.nan, 0.1, math.nan, 0.5).on_top_of({"image_price_db": 0.01})
-    assert math.isnan(costs.image_price_db) and math.isnan(costs.lost_surface_mass)
-    assert costs.lost_mass == 0.1
 
 
 def test_nothing_is_skipped_when_no_threshold_fits() -> None:
@@ -349,13 +328,19 @@ def test_a_backdrop_is_worth_what_the_image_loses_without_it() -> None:
     assert backdrop_price(DenseRendering([], [], problem.render_kept)) == 0.0
 
 
-def test_without_an_image_there_is_no_image_price() -> None:
+def test_without_an_image_there_is_no_image_price_and_no_rays_cost_nothing() -> None:
     assert math.isnan(measure(Problem(0).rendering(), 0.1, with_image=False).image_price_db)
-
-
-def test_no_rays_at_all_cost_nothing() -> None:
     found = measure(DenseRendering([], [], lambda i, mask: mask), 0.5)
     assert found.lost_surface_mass == found.lost_mass == found.empty_fraction == 0.0
+
+
+def shaded_of(
+    weights: Tensor, ray_indices: Tensor, accumulation: Tensor, logits: Tensor | None = None
+) -> Shaded:
+    """What is known of rays [R] by their weights [N] and their accumulation [R]."""
+    none, packed = torch.zeros(0), pack_info(ray_indices, len(accumulation))
+    logits = none if logits is None else logits
+    return Shaded(none, accumulation, none, weights, none, logits, none, packed)
 
 
 @settings(deadline=None, max_examples=30)
@@ -365,12 +350,10 @@ def test_near_the_median_depth_is_within_two_steps_of_it(seed: int) -> None:
     counts = torch.tensor([7, 0, 12, 1, 30])
     ray_indices = torch.arange(5).repeat_interleave(counts)
     starts = torch.cat([torch.arange(int(count)) * 0.5 for count in counts])
-    intervals = Intervals(ray_indices, starts, starts + 0.5)
     weights = torch.rand(50) ** 8 / 30
     accumulation = accumulate_along_rays(weights, None, ray_indices, 5)[:, 0]
-    none = torch.zeros(0)
-    shaded = Shaded(none, accumulation, none, weights, none, none, none, pack_info(ray_indices, 5))
-    near = near_median_depth(shaded, intervals)
+    shaded = shaded_of(weights, ray_indices, accumulation)
+    near = near_median_depth(shaded, Intervals(ray_indices, starts, starts + 0.5))
     for ray in range(5):
         mine = (ray_indices == ray).nonzero()[:, 0].tolist()
         total = 0.0
@@ -379,47 +362,39 @@ def test_near_the_median_depth_is_within_two_steps_of_it(seed: int) -> None:
             if total >= 0.5 * float(accumulation[ray]) * (1 - 1e-6):
                 break
         for sample in mine:
-            expected = abs(sample - median) <= SURFACE_STEPS
-            assert bool(near[sample]) == expected
+            assert bool(near[sample]) == (abs(sample - median) <= SURFACE_STEPS)
 
 
 def test_before_a_backdrop_that_holds_the_median_there_is_no_surface() -> None:
-    ray_indices = torch.arange(3).repeat_interleave(4)
-    starts = torch.arange(4).repeat(3) * 0.5
+    ray_indices, starts = torch.arange(3).repeat_interleave(4), torch.arange(4).repeat(3) * 0.5
     intervals = Intervals(ray_indices, starts, starts + 0.5)
     hazy, solid, thin = [0.0, 0.2, 0.2, 0.6], [0.0, 0.7, 0.1, 0.2], [0.5, 0.0, 0.0, 0.5]
-    weights, none = torch.tensor([*hazy, *solid, *thin]), torch.zeros(0)
-    packed = pack_info(ray_indices, 3)
-    shaded = Shaded(none, torch.ones(3), none, weights, none, none, none, packed)
-    near = near_surface(
-        *weighed(shaded), intervals, torch.tensor([False, False, False, True]).repeat(3)
-    )
+    shaded = shaded_of(torch.tensor([*hazy, *solid, *thin]), ray_indices, torch.ones(3))
+    backdrops = torch.tensor([False, False, False, True]).repeat(3)
+    near = near_surface(*weighed(shaded), intervals, backdrops)
     assert near.view(3, 4).tolist() == [[False] * 4, [True] * 4, [True, True, True, False]]
     everywhere = near_surface(*weighed(shaded), intervals, torch.zeros(12, dtype=torch.bool))
     assert torch.equal(everywhere, near_median_depth(shaded, intervals))
 
 
 def test_a_field_without_surfaces_does_not_pass_for_one_with_nothing_to_lose() -> None:
-    rays = Rays(
-        torch.zeros(50, 3), torch.ones(50, 3), torch.zeros(50), torch.full((50,), 2.0), None
-    )
-    ray_indices = torch.arange(50).repeat_interleave(4)
-    starts = torch.arange(4).repeat(50) * 0.5
-    intervals, logits = Intervals(ray_indices, starts, starts + 0.5), torch.zeros(200, 2)
-    packed, none = pack_info(ray_indices, 50), torch.zeros(0)
+    ends = torch.zeros(50), torch.full((50,), 2.0)
+    rays = Rays(torch.zeros(50, 3), torch.ones(50, 3), *ends, None)
+    ray_indices, starts = torch.arange(50).repeat_interleave(4), torch.arange(4).repeat(50) * 0.5
+    intervals = Intervals(ray_indices, starts, starts + 0.5)
     weights = torch.tensor([0.0, 0.2, 0.2, 0.6]).repeat(50)
     for solid in (0, 1):
         weights[1 : 4 * solid : 4] = 0.9
-        shaded = Shaded(none, torch.ones(50), none, weights, none, logits, none, packed)
+        shaded = shaded_of(weights, ray_indices, torch.ones(50), torch.zeros(200, 2))
         near = reference_of(shaded, intervals, rays).near_surface
         assert int(near.sum()) == (4 if solid else 150)
 
 
 def test_no_samples_have_no_median() -> None:
     none, no_rays = torch.zeros(0), torch.zeros(0, dtype=torch.int64)
-    shaded = Shaded(none, torch.zeros(3), none, none, none, none, none, pack_info(no_rays, 3))
-    assert near_median_depth(shaded, Intervals(no_rays, none, none)).shape == (0,)
-    assert near_surface(*weighed(shaded), Intervals(no_rays, none, none), none.bool()).shape == (0,)
+    shaded, nothing = shaded_of(none, no_rays, torch.zeros(3)), Intervals(no_rays, none, none)
+    assert near_median_depth(shaded, nothing).shape == (0,)
+    assert near_surface(*weighed(shaded), nothing, none.bool()).shape == (0,)
 
 
 @settings(deadline=None, max_examples=30)

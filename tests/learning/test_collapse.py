@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -31,6 +32,9 @@ SPREAD = torch.tensor([0.5, 0.25, 0.25])
 ONE = torch.tensor([0.5, 0.5, 0.0])
 
 
+LOSSES, PAPER = GateLossConfig(), GateLossConfig(form="paper")
+
+
 def head_of(bias: list[float]) -> torch.nn.Linear:
     head = torch.nn.Linear(4, 3)
     with torch.no_grad():
@@ -38,11 +42,24 @@ def head_of(bias: list[float]) -> torch.nn.Linear:
     return head
 
 
+def healed(
+    kind: Any,
+    progress: Progress,
+    step: int,
+    losses: GateLossConfig = LOSSES,
+    shares: torch.Tensor = SPREAD,
+    head: torch.nn.Linear | None = None,
+) -> str:
+    """What is said once a collapse of that kind, found at that step, is healed."""
+    head = head_of([0.0] * 3) if head is None else head
+    return heal(head, progress, Collapse("a cause", kind), shares, step, losses)
+
+
 def test_a_collapse_must_last_unless_the_first_phase_is_over() -> None:
     progress = Progress()
     assert look(progress, 98, 0.0, SPREAD, last=True) is None  # too early to tell
-    assert look(progress, 199, 0.0, SPREAD, last=False) is None
-    assert look(progress, 298, 0.0, SPREAD, last=False) is None
+    for step in (199, 298):
+        assert look(progress, step, 0.0, SPREAD, last=False) is None
     assert look(progress, 299, 0.0, SPREAD, last=False) is not None
     assert look(Progress(), 299, 1.0, SPREAD, last=True) is not None
     assert look(progress, 324, 0.3, SPREAD, last=False) is None
@@ -52,20 +69,20 @@ def test_a_collapse_must_last_unless_the_first_phase_is_over() -> None:
 @pytest.mark.parametrize(("kind", "pull"), [("empty", 1.0 / EASED), ("occupied", EASED)])
 def test_a_healed_gate_learns_on_dense_samples_first_and_under_less_pressure(kind, pull) -> None:
     progress = Progress(learn_steps=200, configured=200, suspected_since=90)
-    head, losses = head_of([30.0, 0.0, 0.0]), GateLossConfig()
-    said = heal(head, progress, Collapse("a cause", kind), SPREAD, 199, losses)
+    head = head_of([30.0, 0.0, 0.0])
+    said = healed(kind, progress, 199, head=head)
     assert not bool(head.bias.any()) and "dense samples to step 250" in said
     assert (progress.recoveries, progress.suspected_since) == (1, -1)
     assert (progress.learn_steps, progress.dense_until) == (300, 250)
     assert is_dense(progress, 249) and not is_dense(progress, 250)
 
-    begins, half, ends = (annealed(losses, progress, step) for step in (199, 224, 250))
+    begins, half, ends = (annealed(LOSSES, progress, step) for step in (199, 224, 250))
     assert begins.contribution == begins.imbalance == begins.density == begins.agreement == 0.0
-    assert half.contribution == pytest.approx(25 / 51 * losses.contribution)
-    assert ends.contribution == losses.contribution and ends.density == losses.density
-    assert ends.imbalance == pytest.approx(pull * losses.imbalance)
-    assert ends.emphasis == pytest.approx(losses.emphasis / pull)
-    assert ends.balance == losses.balance
+    assert half.contribution == pytest.approx(25 / 51 * LOSSES.contribution)
+    assert ends.contribution == LOSSES.contribution and ends.density == LOSSES.density
+    assert ends.imbalance == pytest.approx(pull * LOSSES.imbalance)
+    assert ends.emphasis == pytest.approx(LOSSES.emphasis / pull)
+    assert ends.balance == LOSSES.balance
 
 
 @pytest.mark.parametrize("last", [False, True])
@@ -77,101 +94,77 @@ def test_after_all_recoveries_only_a_gate_that_keeps_nothing_ends_the_run(last: 
 
 
 def test_a_form_that_was_given_up_stays_given_up() -> None:
-    paper, progress = GateLossConfig(form="paper"), Progress(learn_steps=200)
-    heal(head_of([0] * 3), progress, Collapse("a cause", "useless"), SPREAD, 199, paper)
-    assert form_of(paper, progress) == "logit"
-    heal(head_of([0] * 3), progress, Collapse("a cause", "occupied"), SPREAD, 299, paper)
-    assert form_of(paper, progress) == "logit" and progress.pace == 0.25
-    kept_to = annealed(replace(paper, fall_back=False), Progress(pull=4.0, paper_given_up=True), 0)
-    assert kept_to.imbalance == 4.0 * paper.imbalance  # what its own recoveries have earned
-
-
-def test_points_that_are_shared_out_are_no_new_last_layer() -> None:
     progress = Progress(learn_steps=200)
-    heal(
-        head_of([0, 9, 0]), progress, Collapse("a cause", "one expert"), ONE, 150, GateLossConfig()
-    )
-    assert not is_restart_due(Collapse("a cause", "empty"), GateLossConfig(), progress)
+    healed("useless", progress, 199, PAPER)
+    assert form_of(PAPER, progress) == "logit"
+    healed("occupied", progress, 299, PAPER)
+    assert form_of(PAPER, progress) == "logit" and progress.pace == 0.25
+    kept_to = annealed(replace(PAPER, fall_back=False), Progress(pull=4.0, paper_given_up=True), 0)
+    assert kept_to.imbalance == 4.0 * PAPER.imbalance  # what its own recoveries have earned
 
 
 def test_points_of_one_expert_are_shared_out_and_the_balance_counts_more() -> None:
     progress, head = Progress(learn_steps=200, configured=200), head_of([0.0, 30.0, 0.0])
-    heal(head, progress, Collapse("a cause", "one expert"), ONE, 150, GateLossConfig())
+    healed("one expert", progress, 150, shares=ONE, head=head)
     assert (head.bias[1] - head.bias[2]).abs() < 1e-6
     assert progress.learn_steps == 201 and not is_dense(progress, 151)
-    assert annealed(GateLossConfig(), progress, 151).balance == EASED * GateLossConfig().balance
+    assert annealed(LOSSES, progress, 151).balance == EASED * LOSSES.balance
+    assert not is_restart_due(Collapse("a cause", "empty"), LOSSES, progress)  # no new last layer
 
 
 def test_a_gate_in_the_papers_form_that_less_force_does_not_heal_is_taught_in_logit_form() -> None:
-    paper, progress, head = (
-        GateLossConfig(form="paper"),
-        Progress(learn_steps=200),
-        head_of([0] * 3),
-    )
+    progress, head = Progress(learn_steps=200), head_of([0.0] * 3)
     for number in range(2):
-        assert form_of(paper, progress) == "paper"
-        said = heal(head, progress, Collapse("a cause", "occupied"), SPREAD, 199 + number, paper)
+        assert form_of(PAPER, progress) == "paper"
+        said = healed("occupied", progress, 199 + number, PAPER, head=head)
         assert ("logit form" in said) == (number == 1)
-    taught = annealed(paper, progress, 10_000)
-    assert taught == replace(paper, form="logit")  # nothing of what was wrong is eased or pressed
+    taught = annealed(PAPER, progress, 10_000)
+    assert taught == replace(PAPER, form="logit")  # nothing of what was wrong is eased or pressed
     again = Progress.from_dict(progress.to_dict())
-    assert form_of(paper, again) == "logit" and form_of(GateLossConfig(), Progress()) == "logit"
-    assert form_of(replace(paper, fall_back=False), again) == "paper"
-    said = heal(head, progress, Collapse("a cause", "occupied"), SPREAD, 299, paper)
+    assert form_of(PAPER, again) == "logit" and form_of(LOSSES, Progress()) == "logit"
+    assert form_of(replace(PAPER, fall_back=False), again) == "paper"
+    said = healed("occupied", progress, 299, PAPER, head=head)
     assert "gate and field start anew" in said  # what is left for one that collapses in logit form
 
 
-def test_a_gate_that_has_called_nothing_empty_yet_has_until_the_end_to_learn_it() -> None:
+def test_a_new_or_healed_gate_has_until_the_end_to_call_something_empty() -> None:
     progress = Progress()
     for step in range(49, 999, 50):
         assert look(progress, step, 1.0, SPREAD, last=False) is None
     assert look(progress, 999, 1.0, SPREAD, last=True) is not None
-
-
-def test_a_healed_gate_has_as_long_as_a_new_one_to_call_something_empty() -> None:
     progress = Progress(learn_steps=200, configured=200)
     assert look(progress, 99, 0.3, SPREAD, last=False) is None  # it has called much empty
-    heal(head_of([0] * 3), progress, Collapse("a cause", "empty"), SPREAD, 149, GateLossConfig())
+    healed("empty", progress, 149)
     for step in range(199, 999, 50):
         assert look(progress, step, 1.0, SPREAD, last=False) is None
 
 
 def test_a_second_recovery_counts_whatever_it_is_from() -> None:
-    paper, progress = GateLossConfig(form="paper"), Progress(learn_steps=200)
+    progress = Progress(learn_steps=200)
     for kind in ("empty", "one expert"):
-        said = heal(head_of([0] * 3), progress, Collapse("a cause", kind), ONE, 199, paper)
-    assert form_of(paper, progress) == "logit" and "logit form" in said
+        said = healed(kind, progress, 199, PAPER, ONE)
+    assert form_of(PAPER, progress) == "logit" and "logit form" in said
 
 
-def test_what_is_a_comparison_stays_in_the_form_that_is_asked_for() -> None:
-    losses, progress = GateLossConfig(form="paper", fall_back=False), Progress(learn_steps=200)
+def test_a_comparison_and_a_run_that_was_never_healed_keep_what_is_configured() -> None:
+    losses, progress = replace(PAPER, fall_back=False), Progress(learn_steps=200)
     for number in range(MOST_RECOVERIES):
-        heal(head_of([0] * 3), progress, Collapse("a cause", "occupied"), SPREAD, number, losses)
+        healed("occupied", progress, number, losses)
     assert form_of(losses, progress) == "paper"
+    assert annealed(LOSSES, Progress(), 0) == LOSSES
 
 
-def test_a_run_that_was_never_healed_is_taught_as_configured() -> None:
-    assert annealed(GateLossConfig(), Progress(), 0) == GateLossConfig()
-
-
-def test_a_gate_that_was_opened_again_late_is_healed_as_quickly_as_an_early_one() -> None:
-    progress, head = Progress(learn_steps=20_000, configured=200), head_of([0.0, 0.0, 0.0])
-    heal(
-        head,
-        progress,
-        Collapse("the gate calls all space empty"),
-        torch.ones(3) / 3,
-        19_000,
-        GateLossConfig(),
-    )
-    assert (progress.learn_steps, progress.dense_until) == (19_101, 19_051)
-
-
-def test_a_gate_that_begins_anew_learns_on_dense_samples_for_a_quarter_of_its_phase() -> None:
-    progress, head = Progress(learn_steps=200, configured=200, healed_at=50), head_of([0.0] * 3)
-    losses = GateLossConfig(form="logit")
-    heal(head, progress, Collapse("the gate calls all space empty"), SPREAD, 199, losses)
-    assert (progress.learn_steps, progress.dense_until) == (400, 250)
+@pytest.mark.parametrize(
+    ("learned", "healed_at", "step", "then"),
+    [(20_000, None, 19_000, (19_101, 19_051)), (200, 50, 199, (400, 250))],
+    ids=["as quickly as an early one", "anew, a quarter on dense samples"],
+)
+def test_a_gate_that_was_opened_late_or_begins_anew_is_healed(learned, healed_at, step, then):
+    progress = Progress(learn_steps=learned, configured=200)
+    if healed_at is not None:
+        progress.healed_at = healed_at
+    healed("empty", progress, step)
+    assert (progress.learn_steps, progress.dense_until) == then
 
 
 @pytest.mark.parametrize(
@@ -180,23 +173,15 @@ def test_a_gate_that_begins_anew_learns_on_dense_samples_for_a_quarter_of_its_ph
         (0.0, [1.0, 0.0, 0.0], False, "all space empty"),
         (1.0, [0.0, 0.5, 0.5], True, "all space occupied"),
         (0.3, [0.7, 0.0, 0.3], False, "scene expert 2 takes all points"),
+        (0.3, [0.7, 0.2, 0.1], True, None),
+        (1.0, [0.0, 0.5, 0.5], False, None),  # it has not learned enough yet
+        (0.3, [0.7, 0.3], True, None),  # there is only one scene expert
     ],
 )
 def test_a_collapse_is_named(kept: float, shares: list[float], has_learned: bool, cause) -> None:
-    collapse = find_collapse(kept, torch.tensor(shares), has_learned)
-    assert collapse is not None and cause in collapse.cause and "\n" not in collapse.cause
-
-
-@pytest.mark.parametrize(
-    ("kept", "shares", "has_learned"),
-    [
-        (0.3, [0.7, 0.2, 0.1], True),
-        (1.0, [0.0, 0.5, 0.5], False),  # it has not learned enough yet
-        (0.3, [0.7, 0.3], True),  # there is only one scene expert
-    ],
-)
-def test_a_gate_that_decides_has_not_collapsed(kept: float, shares, has_learned: bool) -> None:
-    assert find_collapse(kept, torch.tensor(shares), has_learned) is None
+    found = find_collapse(kept, torch.tensor(shares), has_learned)
+    assert (found is None) == (cause is None)
+    assert found is None or (cause in found.cause and "\n" not in found.cause)
 
 
 def test_a_reset_gate_is_undecided_again() -> None:

@@ -88,9 +88,7 @@ def test_a_run_without_one_has_none(mixture: Mixture, tmp_path: Path) -> None:
     assert field_at_freezing(mixture, tmp_path) is None
 
 
-def test_a_damaged_one_and_one_of_another_gate_are_refused_in_a_line(
-    mixture: Mixture, tmp_path: Path
-) -> None:
+def test_a_damaged_or_foreign_field_is_refused(mixture: Mixture, tmp_path: Path) -> None:
     leave_field(mixture, tmp_path)
     path = tmp_path / FIELD_FILE
     whole = path.read_bytes()
@@ -107,9 +105,7 @@ def test_a_damaged_one_and_one_of_another_gate_are_refused_in_a_line(
 
 
 @pytest.mark.parametrize("what", ["checkpoint", "folder"])
-def test_a_run_that_resumes_in_a_folder_of_its_own_takes_it_along(
-    what: str, mixture: Mixture, tmp_path: Path
-) -> None:
+def test_a_resumed_run_takes_it_along(what: str, mixture: Mixture, tmp_path: Path) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     leave_field(mixture, first)
     checkpoint = first / "nerfstudio_models" / "step-000000009.ckpt"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -24,30 +25,21 @@ def learner(monkeypatch: pytest.MonkeyPatch) -> Learner:
     return small_learner(ARun())
 
 
-def test_the_probe_positions_lie_on_their_rays_within_the_bounds(learner: Learner) -> None:
-    positions = learner.mixture.region.space.unmap(learner.probes.positions)
+def test_looks_are_at_the_same_positions_on_rays_within_the_bounds(learner: Learner) -> None:
+    probes = learner.probes
+    positions = learner.mixture.region.space.unmap(probes.positions)
     assert positions.shape == (PROBES, 3)
     assert float(positions[:, 0].min()) >= 0.499 and float(positions[:, 0].max()) <= 2.001
     assert set(positions[:, 1].round(decimals=3).tolist()) == {float(ray) for ray in range(9)}
-
-
-def test_every_look_is_at_the_same_positions_found_once(learner: Learner) -> None:
-    probes = learner.probes
     first, again = probes.logits(), learner.probes.logits()
     assert torch.equal(first, again) and first.shape == (PROBES, 3)
     assert learner.probes is probes and not first.requires_grad
-
-
-def test_a_look_sees_what_the_gate_has_learned_since(learner: Learner) -> None:
-    before = learner.probes.logits()
     with torch.no_grad():
         learner.mixture.gate.head.bias += 1.0
-    torch.testing.assert_close(learner.probes.logits(), before + 1.0)
+    torch.testing.assert_close(learner.probes.logits(), first + 1.0)
 
 
-def test_a_field_that_starts_anew_keeps_its_parameters_and_forgets_what_they_were(
-    learner: Learner,
-) -> None:
+def test_a_field_that_starts_anew_keeps_its_parameters(learner: Learner) -> None:
     field = learner.mixture.field
     optimizer = torch.optim.Adam(field.parameters(), lr=1.0)
     learner.run = learner.recoveries.run = ARun(optimizers=[optimizer])
@@ -64,7 +56,7 @@ def test_a_field_that_starts_anew_keeps_its_parameters_and_forgets_what_they_wer
 
 
 def test_a_full_disk_costs_the_history_and_not_the_run(
-    learner: Learner, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    learner: Learner, monkeypatch: pytest.MonkeyPatch, printed: Any
 ) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
@@ -75,20 +67,18 @@ def test_a_full_disk_costs_the_history_and_not_the_run(
     monkeypatch.setattr(GateHistory, "save", full)
     learner.after_step(3, 0.0, 1.0)
     assert learner.history.steps == [3]
-    assert "could not be written" in " ".join(capsys.readouterr().out.split())
+    assert "could not be written" in printed()
 
 
-def test_a_short_run_says_once_that_half_of_it_is_for_learning(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_short_run_says_once_that_half_is_learning(printed: Any) -> None:
     short, progress = ARun(end=125), Progress()
     small_learner(short, progress=progress).begin()
-    said = " ".join(capsys.readouterr().out.split())
+    said = printed()
     assert "of 125 steps" in said and "until step 62," in said
     small_learner(short, progress=progress).begin()  # resumed
     few = ScheduleConfig(learn_steps=50)
     small_learner(short, progress=Progress(), schedule=few).begin()  # all of them fit
-    assert capsys.readouterr().out == ""
+    assert printed() == ""
 
 
 def test_learning_on_takes_a_quarter_more_and_is_said(

@@ -34,33 +34,15 @@ def test_every_kind_of_gate_learns_a_ball(kind: str, monkeypatch: pytest.MonkeyP
     assert not any(parameter.requires_grad for parameter in gate.parameters())
 
 
-def test_the_loss_is_the_contribution_loss() -> None:
-    """What `teach` minimises, with the targets of `leco-occupancy`, is its gate's own loss."""
-    torch.manual_seed(0)
-    logits, weights = torch.randn(100, 2), 0.3 * torch.rand(100)
-    target = (weights / 0.15).clamp(max=1.0)
-    occupied = occupancy_logit(logits)
-    keep, skip = 8.0 * target, 1.0 - target
-    softplus = torch.nn.functional.softplus
-    found = (keep * softplus(-occupied) + skip * softplus(occupied)).mean()
-    torch.testing.assert_close(found, contribution_loss(logits, weights, 0.15, 8.0))
-
-
-def test_the_same_seed_gives_the_same_gate_and_leaves_other_dice_alone() -> None:
-    config = GateConfig(EncodingConfig(octaves=2), 8, 1, 1)
-    torch.manual_seed(3)
-    before = torch.get_rng_state()
-    first = teach(config, ball_lesson(1000), 3, "float32")
+def test_the_seed_decides_the_gate_and_other_dice_are_left_alone() -> None:
+    config, lesson = GateConfig(EncodingConfig(octaves=2), 8, 1, 1), ball_lesson(1000)
+    before = torch.random.manual_seed(3).get_state()
+    first, again, other = (teach(config, lesson, 3, "float32", seed) for seed in (0, 0, 1))
     assert torch.equal(torch.get_rng_state(), before)
-    second = teach(config, ball_lesson(1000), 3, "float32")
-    for a, b in zip(first.parameters(), second.parameters()):
-        assert torch.equal(a, b)
-
-
-def test_another_seed_begins_with_another_gate() -> None:
-    config, lesson = GateConfig(EncodingConfig(octaves=2), 8, 1, 1), ball_lesson(1)
-    first, second = (teach(config, lesson, 1, "float32", seed) for seed in (0, 1))
-    assert not torch.equal(first.head.weight, second.head.weight)
+    assert all(map(torch.equal, first.parameters(), again.parameters()))
+    assert not torch.equal(first.head.weight, other.head.weight)
+    begun = (teach(config, ball_lesson(1), 1, "float32", seed).head.weight for seed in (0, 1))
+    assert not torch.equal(*begun)
 
 
 def test_the_rate_falls_by_a_half_cosine_to_a_twentieth(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -149,9 +149,7 @@ class Drawn(NoPixels):
         return mixture.rays(rays.origins, rays.directions, images), torch.rand(count, 3)
 
 
-def test_what_is_empty_and_what_is_skipped_stays_so(
-    mixture: Mixture, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_empty_and_what_is_skipped_stays_so(mixture: Mixture, printed: Any) -> None:
     before = occupancies(mixture)
     params = sum(parameter.numel() for parameter in mixture.field.parameters())
     run = ARun()
@@ -164,7 +162,7 @@ def test_what_is_empty_and_what_is_skipped_stays_so(
     assert sum(p.numel() for p in mixture.field.parameters()) == params - 3 * each
     (groups,) = kept
     assert sum(p.numel() for p in groups["field"]) <= params - 3 * each
-    assert "scene experts: 1 left; dropped" in " ".join(capsys.readouterr().out.split())
+    assert "scene experts: 1 left; dropped" in printed()
 
 
 def test_a_checkpoint_of_a_field_without_some_experts_renders_the_same(mixture: Mixture) -> None:

@@ -4,37 +4,30 @@ from __future__ import annotations
 
 import io
 
+import pytest
 import torch
 
 from leco_plugin.learning.run import Progress, WatchState
 
 
-def test_a_new_run_learns_as_long_as_configured_unless_it_is_short() -> None:
-    long, short = Progress(), Progress()
-    long.begin(200, most=2000)
-    short.begin(200, most=15)
-    assert (long.learn_steps, short.learn_steps) == (200, 15)
-
-
-def test_a_resumed_run_keeps_its_schedule_however_few_steps_are_left() -> None:
-    progress = Progress()
-    progress.begin(200, most=2000)
-    progress.learn_steps = 300  # healed
-    resumed = Progress.from_dict(progress.to_dict())
-    resumed.begin(200, most=10)
-    assert resumed.learn_steps == 300
-
-
-def test_a_run_resumed_with_another_schedule_takes_that_one() -> None:
-    progress = Progress(learn_steps=300, configured=200, recoveries=1)
-    progress.begin(400, most=2000)
-    assert progress.learn_steps == 400 and progress.recoveries == 1
-    anew = Progress(learn_steps=501, configured=200, recoveries=2, began=301)
-    anew.begin(400, most=2000)
-    assert anew.learn_steps == 701  # counted from where gate and field began anew
-    healed = Progress(learn_steps=5091, configured=200, recoveries=1, healed_at=4990)
-    healed.begin(400, most=2000)
-    assert healed.learn_steps == 5391  # or from its new last layer
+@pytest.mark.parametrize(
+    ("progress", "configured", "most", "learn_steps"),
+    [
+        (Progress(), 200, 2000, 200),
+        (Progress(), 200, 15, 15),
+        # resumed, however few steps are left
+        (Progress(learn_steps=300, configured=200), 200, 10, 300),
+        # with another schedule: counted from where gate and field began anew, or a new last layer
+        (Progress(learn_steps=300, configured=200, recoveries=1), 400, 2000, 400),
+        (Progress(learn_steps=501, configured=200, recoveries=2, began=301), 400, 2000, 701),
+        (Progress(learn_steps=5091, configured=200, recoveries=1, healed_at=4990), 400, 2000, 5391),
+    ],
+)
+def test_a_run_learns_as_long_as_configured(progress, configured, most, learn_steps) -> None:
+    healed = progress.recoveries
+    progress = Progress.from_dict(progress.to_dict())
+    progress.begin(configured, most=most)
+    assert (progress.learn_steps, progress.recoveries) == (learn_steps, healed)
 
 
 def test_a_learning_phase_is_counted_from_where_it_began() -> None:

@@ -84,9 +84,7 @@ def test_what_a_run_reached_is_kept_in_its_occupancy(tmp_path: Path) -> None:
     assert doubts(describe(Occupancy.load(path))) == []
 
 
-def test_what_a_run_reached_is_said_where_it_cannot_be_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_hides_no_doubts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 

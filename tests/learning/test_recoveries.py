@@ -21,6 +21,8 @@ from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.occupancy import Occupancy
 
 SPREAD = torch.tensor([0.5, 0.25, 0.25])
+ONE_EXPERT = torch.tensor([[20.0, 0.0, 0.0], [0.0, 20.0, 0.0]] * 50)
+OCCUPIED = torch.tensor([[0.0, 20.0, 20.0 - 1e-3]] * 100)
 
 
 def steps_of(run: SimpleNamespace, count: int) -> Iterator[int]:
@@ -29,6 +31,13 @@ def steps_of(run: SimpleNamespace, count: int) -> Iterator[int]:
         run.learner.before_step(step)
         run.learner.after_step(step, 0.0, 1.0)
         yield step
+
+
+def go_until_frozen(run: SimpleNamespace, count: int) -> None:
+    """Takes steps until the gate is frozen, so many at most."""
+    for _ in steps_of(run, count):
+        if run.frozen:
+            break
 
 
 @pytest.fixture
@@ -78,7 +87,7 @@ def healthy_run() -> Callable[..., SimpleNamespace]:
     ],
 )
 def test_a_collapse_is_found_within_200_steps_of_its_start(
-    looks: list[list[float]], cause: str, starts: int, per_check: int, healthy_run, capsys
+    looks: list[list[float]], cause: str, starts: int, per_check: int, healthy_run, printed: Any
 ) -> None:
     run = healthy_run(ScheduleConfig(learn_steps=2000, steps_per_check=per_check))
     for step in range(2000):
@@ -89,7 +98,7 @@ def test_a_collapse_is_found_within_200_steps_of_its_start(
         if run.progress.recoveries:
             break
     assert starts + 95 <= step < starts + 200
-    said = " ".join(capsys.readouterr().out.split())
+    said = printed()
     assert f"step {step}: " in said and cause in said and "(recovery" in said
 
 
@@ -113,14 +122,10 @@ def test_a_gate_that_collapses_again_and_again_ends_the_run_in_one_line(healthy_
     assert run.progress.recoveries == 3
 
 
-def test_a_gate_that_keeps_everything_after_three_recoveries_is_frozen_all_the_same(
-    healthy_run,
-) -> None:
+def test_a_gate_that_keeps_everything_is_frozen_after_three_recoveries(healthy_run) -> None:
     run = healthy_run(ScheduleConfig(learn_steps=200))
-    run.looks = torch.tensor([[0.0, 20.0, 20.0 - 1e-3]]).expand(100, 3)
-    for _ in steps_of(run, 10_000):
-        if run.frozen:
-            break
+    run.looks = OCCUPIED
+    go_until_frozen(run, 10_000)
     assert run.frozen and run.progress.recoveries == 3
 
 
@@ -135,7 +140,7 @@ def test_a_gate_that_keeps_everything_after_three_recoveries_is_frozen_all_the_s
     ],
 )
 def test_a_gate_in_the_papers_form_by_which_hardly_anything_is_skipped_is_taught_otherwise(
-    losses: GateLossConfig, skipped: float, recoveries: int, healthy_run, capsys
+    losses: GateLossConfig, skipped: float, recoveries: int, healthy_run, printed: Any
 ) -> None:
     schedule = ScheduleConfig(learn_steps=200)
     run = healthy_run(schedule, threshold=0.0, skipped=skipped, gate_loss=losses)
@@ -146,14 +151,12 @@ def test_a_gate_in_the_papers_form_by_which_hardly_anything_is_skipped_is_taught
             break
     assert run.progress.recoveries == recoveries
     assert run.frozen[-1] - run.frozen[0] <= 100
-    said = "taught in logit form from now on" in " ".join(capsys.readouterr().out.split())
+    said = "taught in logit form from now on" in printed()
     assert said == bool(recoveries)
 
 
 @pytest.mark.parametrize(("end", "again"), [(274, False), (275, True)])
-def test_a_gate_is_opened_again_only_with_steps_to_learn_in_and_its_file_goes(
-    end: int, again: bool, healthy_run, tmp_path: Path
-) -> None:
+def test_a_gate_reopens_only_with_steps(end: int, again: bool, healthy_run, tmp_path: Path) -> None:
     schedule, losses = ScheduleConfig(learn_steps=200), GateLossConfig(form="paper")
     run = healthy_run(schedule, end, threshold=0.0, skipped=0.0, gate_loss=losses)
     run.around.folder = tmp_path
@@ -164,9 +167,7 @@ def test_a_gate_is_opened_again_only_with_steps_to_learn_in_and_its_file_goes(
     assert again or Occupancy.load(tmp_path / FILE_NAME).report["step"] == 174
 
 
-def test_what_collapses_again_in_logit_form_is_learned_anew_and_more_slowly(
-    healthy_run, monkeypatch
-) -> None:
+def test_what_collapses_again_is_learned_anew_and_more_slowly(healthy_run, monkeypatch) -> None:
     run = healthy_run(ScheduleConfig(learn_steps=2000))
     gate, field, optimizer = run.mixture.gate, run.mixture.field, run.optimizer
     gate.hidden[0].weight.grad = torch.ones_like(gate.hidden[0].weight)
@@ -208,12 +209,10 @@ def test_what_is_healed_is_frozen_in_its_run_where_that_has_the_steps(
 
 
 @pytest.mark.parametrize(("end", "freezes_at"), [(1000, 250), (230, 230), (200, 200)])
-def test_points_that_are_shared_out_at_the_end_of_the_phase_are_learned_from(
-    end: int, freezes_at: int, healthy_run
-) -> None:
+def test_points_shared_out_late_are_learned_from(end: int, freezes_at: int, healthy_run) -> None:
     """A quarter of the phase more, or what the run has; in its last step they are left as is."""
     run = healthy_run(ScheduleConfig(learn_steps=200), end)
-    run.looks = torch.tensor([[20.0, 0.0, 0.0], [0.0, 20.0, 0.0]]).repeat(50, 1)
+    run.looks = ONE_EXPERT
     for _ in steps_of(run, end):
         if run.progress.recoveries:
             run.looks = run.sound
@@ -227,43 +226,34 @@ def test_points_that_are_shared_out_at_the_end_of_the_phase_are_learned_from(
 def test_a_gate_that_stays_with_one_expert_is_frozen_all_the_same(form: Any, healthy_run) -> None:
     losses = GateLossConfig(form=form, fall_back=False)
     run = healthy_run(ScheduleConfig(learn_steps=200), gate_loss=losses)
-    run.looks = torch.tensor([[20.0, 0.0, 0.0], [0.0, 20.0, 0.0]]).repeat(50, 1)
-    for _ in steps_of(run, 1000):
-        if run.frozen:
-            break
+    run.looks = ONE_EXPERT
+    go_until_frozen(run, 1000)
     assert run.frozen == [249] and run.progress.recoveries == 1
 
 
 @pytest.mark.parametrize("kind", ["empty", "occupied"])
-def test_without_steps_to_heal_it_in_a_gate_is_frozen_with_what_it_has_learned(
-    kind: str, healthy_run
-) -> None:
+def test_without_steps_to_heal_a_gate_is_frozen_as_it_is(kind: str, healthy_run) -> None:
     run = healthy_run(ScheduleConfig(learn_steps=200), end=299, threshold=0.0)
-    occupied = torch.tensor([[0.0, 20.0, 20.0 - 1e-3]]).expand(100, 3)
-    run.looks = run.empty if kind == "empty" else occupied
+    run.looks = run.empty if kind == "empty" else OCCUPIED
     before = run.mixture.gate.head.weight.clone()
     list(steps_of(run, 200))
     assert run.frozen == [199] and run.progress.recoveries == 0
     assert torch.equal(run.mixture.gate.head.weight, before)
 
 
-ONE_EXPERT = [[20.0, 0.0, 0.0], [0.0, 20.0, 0.0]] * 50
-
-
-@pytest.mark.parametrize(
-    ("looks", "steps"), [([[0.0, 20.0, 20.0 - 1e-3]] * 100, 1900), (ONE_EXPERT, 1650)]
-)
-def test_a_gate_that_is_left_as_it_is_is_said_so_once_and_is_no_longer_suspected(
-    looks: list[list[float]], steps: int, healthy_run, monkeypatch
-) -> None:
+@pytest.mark.parametrize(("looks", "steps"), [(OCCUPIED, 1900), (ONE_EXPERT, 1650)])
+def test_a_gate_left_as_it_is_is_said_once(looks, steps: int, healthy_run, monkeypatch) -> None:
     lines: list[str] = []
     monkeypatch.setattr(recoveries, "say", lines.append)
     run = healthy_run(ScheduleConfig(learn_steps=2000))
     run.progress.recoveries, run.progress.fewest_kept = MOST_RECOVERIES, 0.5
-    run.looks = torch.tensor(looks)
+    run.looks = looks
     list(steps_of(run, steps))
     assert len(lines) == 1 and "it is left as it is" in lines[0]
     assert run.progress.suspected_since == -1
+
+
+OCCUPIED = torch.tensor([[0.0, 20.0, 20.0 - 1e-3]] * 100)
 
 
 def test_experts_that_were_dropped_stay_so_in_a_field_that_is_learned_anew(healthy_run) -> None:

@@ -15,6 +15,7 @@ from leco_plugin.learning import sharpening
 from leco_plugin.learning.calibration import CalibrationConfig, Measured
 from leco_plugin.learning.dense import dense_rendering
 from leco_plugin.learning.history import as_learned
+from leco_plugin.learning.learner import Learner
 from leco_plugin.learning.sharpening import (
     Lesson,
     Sharpened,
@@ -22,7 +23,6 @@ from leco_plugin.learning.sharpening import (
     lesson_by,
     seen_reference,
     sharpen,
-    teach,
 )
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
@@ -188,38 +188,33 @@ class Pixels:
         return 0.0
 
 
-def end_a_run(mixture: Mixture, options: SharpeningConfig) -> None:
-    """The last step, number 30, of a run whose gate was frozen at step 3."""
-    learner = small_learner(
-        ARun(end=31), mixture, Pixels(mixture), sharpening=options, calibration=NEVER_AGAIN
-    )
-    learner.after_step(30, 0.1, 5.0)
+def at_the_end(mixture: Mixture, end: int = 31, **options: Any) -> Learner:
+    """A learner before the last step of a run whose gate was frozen at step 3."""
+    given = {"steps": 5, "least_steps": 10, "rays": 50, "gate": GATE} | options
+    sharpening, run = SharpeningConfig(**given), ARun(end=end)
+    pixels = Pixels(mixture)
+    return small_learner(run, mixture, pixels, sharpening=sharpening, calibration=NEVER_AGAIN)
 
 
 @pytest.mark.parametrize(("end", "sharpened"), [(15, True), (14, False)])
 def test_it_is_sharpened_at_the_end_of_a_run_that_pays_for_it(
-    tmp_path: Path, end: int, sharpened: bool, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, end: int, sharpened: bool, printed: Any
 ) -> None:
     """Frozen at step 3, a run of 15 steps is guided for 10.5 until nine tenths are over."""
     mixture = a_mixture()
-    run = ARun(end=end)
-    run.folder = tmp_path
-    options = SharpeningConfig(steps=100, least_steps=10, rays=200, gate=GATE)
-    learner = small_learner(
-        run, mixture, Pixels(mixture), sharpening=options, calibration=NEVER_AGAIN
-    )
-    last = end - 2
+    learner = at_the_end(mixture, end, steps=100, rays=200)
+    learner.run.folder, last = tmp_path, end - 2
     learner.after_step(last - 1, 0.1, 5.0)
     assert mixture.small is None
     learner.after_step(last, 0.1, 5.0)
     assert (mixture.small is not None) == sharpened
     assert learner.progress.sharpened_at == (last if sharpened else -1)
-    assert run.saved == ([last] if sharpened else [])
+    assert learner.run.saved == ([last] if sharpened else [])
     soon = last + NEVER_AGAIN.steps_per_recheck
     assert learner.watch.state.due == (soon if sharpened else 0), "its price is measured soon"
     if not sharpened:
         return
-    said = " ".join(capsys.readouterr().out.split("taught in")[1].split())
+    said = printed().split("taught in")[1]
     assert "new views may lose more" in said, "the promise is that of the new gate"
     file = Occupancy.load(tmp_path / "occupancy.safetensors")
     assert file.gate.config == GATE and file.threshold == float(mixture.threshold)
@@ -232,13 +227,8 @@ def test_it_is_sharpened_at_the_end_of_a_run_that_pays_for_it(
 
 
 @pytest.mark.parametrize("least_steps", [0, 1, 10])
-def test_a_tenth_of_a_run_is_trained_with_the_small_gate(
-    least_steps: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    mixture, run = a_mixture(), ARun(end=200)
-    options = SharpeningConfig(steps=5, least_steps=least_steps, rays=50, gate=GATE)
-    pixels = Pixels(mixture)
-    learner = small_learner(run, mixture, pixels, sharpening=options, calibration=NEVER_AGAIN)
+def test_a_tenth_of_a_run_is_sharpened(least_steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    learner = at_the_end(a_mixture(), 200, least_steps=least_steps)
     asked: list[int] = []
     monkeypatch.setattr(learner.held_out, "sharpened", lambda *_: asked.append(step))
     for step in range(170, 200):  # a gate that skips no more is not taught again and again
@@ -250,28 +240,29 @@ NEVER_AGAIN = CalibrationConfig(recheck_rays=0)
 
 
 def test_a_gate_that_learns_again_at_the_last_step_is_not_sharpened() -> None:
-    mixture, run = a_mixture(), ARun(end=21)
-    options = SharpeningConfig(steps=5, least_steps=10, rays=50, gate=GATE)
-    learner = small_learner(run, mixture, Pixels(mixture), sharpening=options)
+    mixture = a_mixture()
+    learner = at_the_end(mixture, 21)
     learner._watch = lambda *_: mixture.reopen()  # type: ignore[method-assign]
     learner.after_step(20, 0.1, 0.0)
     assert mixture.small is None and not bool(mixture.frozen)
 
 
-def test_steps_that_pay_are_counted_from_the_last_time() -> None:
+@pytest.mark.parametrize("why", ["too soon after the last time", "another kind", "no positions"])
+def test_at_the_last_step_a_gate_stays(why: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    options: dict[str, Any] = {}
+    if why == "another kind":
+        table = EncodingConfig("hash", levels=2, log2_table=6)
+        options["gate"] = GateConfig(table, 8, 1, 1)
+    elif why == "no positions":
+        empty = Lesson(torch.empty(0, 3), torch.empty(0), torch.empty(0))
+        monkeypatch.setattr(sharpening, "lesson_by", lambda *_: empty)
+    else:
+        options["least_steps"] = 20
     mixture = a_mixture()
-    options = SharpeningConfig(steps=5, least_steps=20, rays=50, gate=GATE)
-    learner = small_learner(ARun(end=31), mixture, Pixels(mixture), sharpening=options)
-    learner.progress.sharpened_at = 15
+    learner = at_the_end(mixture, **options)
+    if why == "too soon after the last time":
+        learner.progress.sharpened_at = 15
     learner.after_step(30, 0.1, 5.0)
-    assert mixture.small is None
-
-
-def test_a_gate_of_a_kind_that_was_asked_for_stays() -> None:
-    mixture = a_mixture()
-    hash_gate = GateConfig(EncodingConfig("hash", levels=2, log2_table=6), 8, 1, 1)
-    options = SharpeningConfig(steps=5, least_steps=10, rays=50, gate=hash_gate)
-    end_a_run(mixture, options)
     assert mixture.small is None
 
 
@@ -287,35 +278,12 @@ def test_prices_of_guided_sharpening_are_sums_of_costs() -> None:
     assert report["surface_error"] == pytest.approx(5e-5)
 
 
-def test_without_a_position_to_teach_with_nothing_is_sharpened(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    empty = Lesson(torch.empty(0, 3), torch.empty(0), torch.empty(0))
-    monkeypatch.setattr(sharpening, "lesson_by", lambda *_: empty)
-    mixture = a_mixture()
-    options = SharpeningConfig(steps=5, least_steps=10, rays=50, gate=GATE)
-    end_a_run(mixture, options)
-    assert mixture.small is None
-
-
-def test_the_same_lesson_teaches_the_same_gate_whatever_was_drawn_before() -> None:
-    lesson = Lesson(2.0 * torch.rand(500, 3) - 1.0, torch.rand(500), torch.rand(500))
-    one, other = (teach(GATE, lesson, 20, "float32", seed) for seed in (3, 3))
-    third = teach(GATE, lesson, 20, "float32", 4)
-    assert all(map(torch.equal, one.parameters(), other.parameters()))
-    assert not all(map(torch.equal, one.parameters(), third.parameters()))
-
-
-def test_what_does_not_pay_changes_nothing() -> None:
-    few = Measured(0.5, 0.0, 0.0, 0.0, 0.5)
-    found = Sharpened(Gate(GATE), few, few, None)
-    assert not found.pays and "the gate stays" in found.line({})
-
-
-def test_the_log_names_the_costs_of_both_gates() -> None:
+def test_the_log_names_the_costs_of_both_gates_and_what_does_not_pay() -> None:
     before, more = (Measured(0.5, 2e-4, 0.0, 0.02, share) for share in (0.5, 0.75))
     line = Sharpened(Gate(GATE), more, before, None).line({"image_price_db": 0.01})
     assert line.startswith("skips 75.0% for +0.030 dB and 2.00e-04 of the surface mass in all")
+    none = Sharpened(Gate(GATE), before, before, None)
+    assert not none.pays and "the gate stays" in none.line({})
 
 
 def test_a_small_gate_travels_with_a_checkpoint_and_leaves_when_the_gate_learns_again() -> None:
@@ -347,10 +315,7 @@ def test_prices_of_a_sharpened_mixture_are_of_the_small_gate() -> None:
     assert 0.05 < float(kept.float().mean()) < 0.25
 
 
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [("steps", -1), ("rays", 0), ("least_steps", -1)],
-)
+@pytest.mark.parametrize(("option", "value"), [("steps", -1), ("rays", 0), ("least_steps", -1)])
 def test_settings_that_make_no_sense_are_refused(option: str, value: float) -> None:
     with pytest.raises(InputError, match=f"sharpening.{option.replace('_', '-')}"):
         SharpeningConfig(**{option: value})

@@ -41,9 +41,7 @@ def shaded_of(occupancies: torch.Tensor, **parts: torch.Tensor) -> Shaded:
 
 @pytest.mark.parametrize("cone_angle", [0.0, 0.1])
 @pytest.mark.parametrize("dropped_below", [0.0, 0.02, 0.5])
-def test_what_is_kept_is_a_share_of_all_candidates_also_of_those_that_were_skipped(
-    dropped_below: float, cone_angle: float
-) -> None:
+def test_what_is_kept_is_a_share_of_all(dropped_below: float, cone_angle: float) -> None:
     torch.manual_seed(0)
     rays = rays_along_x()
     all_of_them = Intervals(*march(marching.Rays(*rays[:4]), March(STEP, cone_angle)))

@@ -53,21 +53,18 @@ def test_nothing_is_drawn_of_them_until_all_train(data: LearningData) -> None:
 
 
 @pytest.mark.parametrize("images", [[torch.zeros(6, 7, 3)] * 40, torch.zeros(16, 6, 7, 3)])
-def test_batches_of_single_or_of_some_pictures_cannot_do_without_any(
-    data: LearningData, images: Any
-) -> None:
+def test_partial_batches_set_no_pictures_aside(data: LearningData, images: Any) -> None:
     data.manager.images["image"] = images
     assert len(data.vouching(4)) == 0
 
 
-def test_what_views_may_lose_is_said_in_a_line() -> None:
-    said = {"count": 9, "worst_surface_mass": 0.00123, "bound": 0.002, "confidence": 0.9}
-    line = views_in_words({CAMERAS_THAT_VOUCH: said})
+SAID = {"count": 9, "worst_surface_mass": 0.00123, "bound": 0.002, "confidence": 0.9}
+
+
+def test_what_views_may_lose_and_skipping_costs_is_said_in_a_line_each() -> None:
+    line = views_in_words({CAMERAS_THAT_VOUCH: SAID})
     assert "0.12%" in line and "0.20%, with 90%" in line
     assert "may lose more" in views_in_words({}) == views_in_words({CAMERAS_THAT_VOUCH: None})
-
-
-def test_what_skipping_costs_is_said_in_a_line() -> None:
     report = {"empty_fraction": 0.85, "image_price_db": -1e-4, "lost_surface_mass": 2.05e-4}
     (line,) = price_in_words(report)
     assert "skips 85.0%" in line and "+0.000 dB and 0.02% of the surfaces" in line
@@ -75,22 +72,17 @@ def test_what_skipping_costs_is_said_in_a_line() -> None:
 
 
 def test_a_report_of_a_small_gate_has_what_views_lose_by_it() -> None:
-    said = {"count": 9, "worst_surface_mass": 0.001, "bound": 0.002, "confidence": 0.9}
     skipped = Measured(0.5, 0.0, 0.0, 0.0, 0.5)._asdict()
-    before = {"params": 7, **skipped, CAMERAS_THAT_VOUCH: said | {"worst_surface_mass": 0.0005}}
+    before = {"params": 7, **skipped, CAMERAS_THAT_VOUCH: SAID | {"worst_surface_mass": 0.0005}}
     config = SharpeningConfig().gate
-    sharpened = Sharpened(Gate(config), Measured(**skipped), Measured(**skipped), said)
-    assert sharpened.report(before, config)[CAMERAS_THAT_VOUCH] == said
+    sharpened = Sharpened(Gate(config), Measured(**skipped), Measured(**skipped), SAID)
+    assert sharpened.report(before, config)[CAMERAS_THAT_VOUCH] == SAID
     unknown = sharpened._replace(promised=None).report(before, config)
     assert unknown == {**sharpened.report(before, config), CAMERAS_THAT_VOUCH: None}
 
 
 @pytest.mark.parametrize(("times", "fits"), [(9.9, True), (10.1, False)])
-def test_no_error_excuses_a_price_of_more_than_ten_times_its_bound(times, fits: bool) -> None:
-    config, endless = CalibrationConfig(), math.inf
-    for name, bound in (
-        ("lost_surface_mass", config.lost_surface_mass),
-        ("image_price_db", config.image_price_db),
-    ):
-        sure = Measured(0.5, 0.0, 0.0, 0.0, 0.5, endless, endless)
-        assert sure._replace(**{name: times * bound}).within(config) == fits
+@pytest.mark.parametrize("price", ["lost_surface_mass", "image_price_db"])
+def test_no_error_excuses_ten_times_the_bound(price: str, times: float, fits: bool) -> None:
+    config, sure = CalibrationConfig(), Measured(0.5, 0.0, 0.0, 0.0, 0.5, math.inf, math.inf)
+    assert sure._replace(**{price: times * getattr(config, price)}).within(config) == fits
