@@ -73,20 +73,19 @@ def after_half_an_hour() -> str:
 
 def of_the_papers_host() -> str:
     """How its ways to sample end where there was more time than the suite gives."""
-    parts = []
+    parts: dict[str, list[str]] = {}
     for _, results in longer("enough-time"):
-        seconds, scene = results["protocol"]["seconds"], results["scene"]["name"]
         ours, *others = lines_of(results)
         others.sort(key=lambda line: -line.psnr)
         rest = ", ".join(
             f"{line.psnr:.1f} with *{line.name}* ({compare(ours.psnrs, line.psnrs).word})"
             for line in others
         )
-        parts.append(
-            f"after {seconds:g} s on `{scene}` {ours.psnr:.1f} dB with a learned occupancy, {rest} "
-            f"({describe_seeds(results)})"
-        )
-    return f"Switch-NeRF, the paper's host, has {'; '.join(parts)}." if parts else ""
+        given = f"after {results['protocol']['seconds']:g} s ({describe_seeds(results)})"
+        scene = f"on `{results['scene']['name']}` {ours.psnr:.1f} dB with a learned occupancy"
+        parts.setdefault(given, []).append(f"{scene}, {rest}")
+    said = "; ".join(f"{given} {'; '.join(scenes)}" for given, scenes in parts.items())
+    return f"Switch-NeRF, the paper's host, has {said}." if parts else ""
 
 
 def half_an_hour() -> str:
