@@ -146,6 +146,8 @@ def export(
 
 def _export_in_words(out: Path, facts: dict[str, Any], frame: str | None) -> list[str]:
     """What was written, a line each; `frame` of points is the one that was asked for."""
+    from leco_plugin.export import counts_in_words
+
     if facts["written"] == "npz":
         return [f"{out}: {facts['shape']} cells, {facts['kept_share_of_cells']:.2%} of them kept"]
     if facts["written"] == "nerfacc-grid":
@@ -154,7 +156,8 @@ def _export_in_words(out: Path, facts: dict[str, Any], frame: str | None) -> lis
             f"{out}: {levels} x {cells}^3 cells, {kept:.2%} of them kept",
             f"for OccGridEstimator({facts['aabbs'][0]}, {cells}, {levels})",
         ]
-    lines = [f"{out}: {facts['points']} points in the coordinates of the {facts['frame']}"]
+    counted = counts_in_words(facts)
+    lines = [f"{out}: {counted}, in the coordinates of the {facts['frame']}"]
     splats = facts["written"] == "splat-init"
     if not facts["photograph_colours"]:
         shown = "grey" if splats else "o(x)"

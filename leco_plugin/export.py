@@ -323,7 +323,7 @@ def export_folder(
 
     drawn = functools.partial(_draw_pictures, occupancy, folder, description)
     splats = folder / "splats.json"
-    picture = "slices of o(x), and the kept points"
+    picture = "slices of o(x), and the surface of what is kept"
     parts = [
         _part(folder, "occupancy.png", drawn, lambda facts: picture),
         exported("kept.ply", "ply", _points_in_words),
@@ -331,7 +331,7 @@ def export_folder(
             splats.name,
             "splat-init",
             lambda facts: (
-                f"{facts['points']:,} points in splats.ply, to start splats from: "
+                f"{counts_in_words(facts)}, in splats.ply, to start splats from: "
                 f"ns-train splatfacto --data {shlex.quote(str(splats))} leco-photographs (on a GPU)"
             ),
         ),
@@ -370,13 +370,20 @@ def _part(folder: Path, name: str, write: Callable[[], Facts], use: Callable[[Fa
     return Part(name, facts, use(facts))
 
 
+def counts_in_words(facts: Facts) -> str:
+    """Of which points there are how many in what was written as `ply` or `splat-init`."""
+    sparse = facts.get("sparse_points", 0)
+    surface = f"{facts['points'] - sparse:,} points on the surface of what is kept"
+    return f"{surface} and {sparse:,} sparse points that are kept" if sparse else surface
+
+
 def _points_in_words(facts: Facts) -> str:
     colours = "of the sparse points" if facts["photograph_colours"] else "o(x)"
     where = "in the coordinates of the data"
     if facts["frame"] == "run":
         where = "in the coordinates of the run, which does not say how it moved the data"
     earth = ", origin on earth in its head" if "geographic_origin" in facts else ""
-    return f"{facts['points']:,} points of the surface {where}{earth}; colours: {colours}"
+    return f"{counts_in_words(facts)}, {where}{earth}; colours: {colours}"
 
 
 def in_words(folder: Path, parts: list[Part], doubted: list[str]) -> list[str]:

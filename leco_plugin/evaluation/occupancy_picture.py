@@ -262,7 +262,7 @@ def _draw_points(axes: Any, points: Tensor, normals: Tensor, heights: tuple[floa
     if len(points) == 0:
         axes.set_title("no surface: all of this is kept, or nothing", fontsize=11)
         return
-    axes.set_title(f"{len(points)} kept points, coloured by height", fontsize=11)
+    axes.set_title("surface of what is kept, coloured by height", fontsize=11)
     low, high = heights
     shares = ((points[:, 2] - low) / max(high - low, 1e-9)).clamp(0, 1)
     light = torch.nn.functional.normalize(torch.tensor([0.35, -0.55, 0.75]), dim=0)

@@ -197,6 +197,10 @@ def test_a_folder_has_everything_and_says_what_each_part_is_for(
     for words in ("colours: of the sparse points", "origin on earth", "leco-photographs"):
         assert words in said
     assert "not written" not in said
+    points, splats = (dict(part.facts or {}) for part in parts if part.name[:4] in ("kept", "spla"))
+    assert said.count(f" {points['points']:,} points on the surface of what is kept") == 2
+    assert points["points"] + splats["sparse_points"] == splats["points"]
+    assert f" and {splats['sparse_points']:,} sparse points that are kept, in splats.ply" in said
 
 
 def test_a_part_that_cannot_be_made_is_one_line_and_the_others_are_written(
