@@ -54,6 +54,8 @@ class ScheduleConfig:
         for name in ("settled", "earliest", "ramp_from", "ramp_to", "agreement"):
             share = getattr(self, name)
             require(0.0 <= share <= 1.0, f"schedule.{name.replace('_', '-')}", share, "from 0 to 1")
+        start, end = self.ramp_from, self.ramp_to
+        require(start <= end, "schedule.ramp-from", start, f"at most ramp-to, {end}")
         every = self.steps_per_record
         require(every >= 0, "schedule.steps-per-record", every, "at least 0")
 

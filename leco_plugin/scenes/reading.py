@@ -164,6 +164,9 @@ def _remedy(error: BaseException, config: Any) -> str:
         return f"{name} adds .png to each file_path, and reads no other kind: leave endings off"
     if hasattr(config, "images_path") and not (data / config.images_path).is_dir():
         return "name the folder of its photographs with --images-path after colmap"
+    if isinstance(error, ImportError):
+        by_system = " (by `sudo apt-get install libusb-1.0-0`)" if "libusb" in str(error) else ""
+        return f"install it{by_system}: {name} needs it"
     if isinstance(error, ZeroDivisionError):
         return "add photographs: a scene is seen from two places at least"
     if isinstance(error, UnidentifiedImageError):

@@ -24,6 +24,11 @@ def test_the_ramp_rises_from_zero_to_one_between_its_ends() -> None:
     assert all(before < after for before, after in pairwise(values[200:601]))
 
 
+def test_a_ramp_that_would_end_before_it_begins_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"ramp-from is 0\.8.*at most ramp-to, 0\.7"):
+        ScheduleConfig(ramp_from=0.8)
+
+
 @pytest.mark.parametrize("learn_steps", [1, 2, 10])
 def test_the_ramp_of_a_short_run_stays_between_zero_and_one(learn_steps: int) -> None:
     values = [ramp(step, ScheduleConfig(learn_steps=learn_steps)) for step in range(20)]

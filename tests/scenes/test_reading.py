@@ -270,6 +270,10 @@ def test_a_photograph_is_turned_where_its_intrinsics_are_for_that(scene: Path) -
         (AssertionError(), "mend SCENE/transforms.json"),
         (EOFError(), "run it on a terminal once, and answer"),
         (KeyError("w"), "add 'w' to SCENE/transforms.json"),
+        (
+            ImportError("libusb-1.0.so.0: cannot open shared object file"),
+            "install it (by `sudo apt-get install libusb-1.0-0`): nerfstudio-data needs it",
+        ),
         (SystemExit(1), "run it on a terminal once, and answer"),
         (RuntimeError("two\nlines"), "mend SCENE/transforms.json"),
         (ValueError("int() with base 10: '\\\\ufeff#'"), "mend SCENE/transforms.json"),
