@@ -22,6 +22,7 @@ from leco_plugin.learning.freezing import FILE_NAME
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers import estimator
+from leco_plugin.scenes.whole_files import PART
 from leco_plugin.studio.commands import show_one_line_in_ns_commands
 from leco_plugin.studio.trainer import AtomicTrainer
 
@@ -33,10 +34,10 @@ HEALED_FREEZES_AT = 17
 
 MOMENTS: dict[str, tuple[type, str, Callable[..., bool]]] = {
     "while it learns": (AtomicTrainer, "train_iteration", lambda _, step: step == 8),
-    "with half of the occupancy's file written": (
+    "with a part of the occupancy's file": (
         type(Path()),
-        "write_bytes",
-        lambda path, _: FILE_NAME in path.name,
+        "open",
+        lambda path, *_: path.name.endswith(PART) and FILE_NAME in path.name,
     ),
     "with the occupancy's file written": (Occupancy, "save", lambda *_: True),
     "with the frozen checkpoint not yet in its place": (
@@ -60,8 +61,8 @@ def die_after(owner: type, name: str, fatal: Callable[..., bool]) -> None:
     """Makes a function kill its process."""
     function = getattr(owner, name)
 
-    def dies(*arguments: Any) -> Any:
-        result = function(*arguments)
+    def dies(*arguments: Any, **options: Any) -> Any:
+        result = function(*arguments, **options)
         if fatal(*arguments):
             os.kill(os.getpid(), signal.SIGKILL)
         return result

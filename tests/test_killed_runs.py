@@ -159,7 +159,7 @@ def assert_finished(folder: Path, last: dict[str, Any], froze_at: int) -> None:
     ("moment", "newest_step", "file"),
     [
         ("while it learns", 6, False),
-        ("with half of the occupancy's file written", 9, False),
+        ("with a part of the occupancy's file", 9, False),
         ("with the occupancy's file written", 9, True),
         ("with the frozen checkpoint not yet in its place", 9, True),
     ],
