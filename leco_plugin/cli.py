@@ -143,6 +143,7 @@ def points(
         json: File for what was found, as JSON.
     """
     check_place("--json", json)
+    check_apart({"--json": json}, data)
     from leco_plugin.scenes.poses.points import find_points
 
     report = find_points(data, size, threads)
@@ -185,10 +186,11 @@ def swap(
     """
     from nerfstudio.scripts.train import main as train
 
+    from leco_plugin.hosts.guided_start import occupancy_file
     from leco_plugin.swap import swapped_config
 
     check_place("--json", json)
-    check_apart({"--json": json}, occupancy)
+    check_apart({"--json": json}, occupancy and occupancy_file(occupancy))
     config = swapped_config(
         method, occupancy, arguments, sampler, options, codes, other_scene, learn_seconds
     )

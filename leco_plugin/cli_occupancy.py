@@ -66,7 +66,9 @@ def inspect(
     from leco_plugin.occupancy import Occupancy
 
     file = occupancy_of(file)
-    check_apart({"--picture": picture, "--history": history, "--json": json}, file)
+    page = None if picture is None else picture.with_suffix(PAGE)
+    written = {"--picture": picture, "the page of --picture": page, "--history": history}
+    check_apart({**written, "--json": json}, file, data)
     occupancy = Occupancy.load(file)
     facts = {**describe(occupancy), "bytes": file.stat().st_size}
     space = facts["space"]
@@ -132,6 +134,7 @@ def export(
     check_place("--json", json)
     file = occupancy_of(file)
     check_apart({"--out": out, "--json": json}, file)
+    check_apart({"--json": json}, data)
     if format is not None:
         facts = made.export(file, format, out, resolution, levels, frame, data)
         print("\n".join(_export_in_words(out, facts, frame)))
@@ -207,7 +210,7 @@ def shrink(
     check_place("--json", json)
     check_picture("--picture", picture)
     file, bounds = occupancy_of(file), Bounds(lost_surface_mass, image_price)
-    check_apart({"--out": out, "--picture": picture, "--json": json}, file)
+    check_apart({"--out": out, "--picture": picture, "--json": json}, file, data)
     results = find_smaller(file, data, out, bounds, keep=lambda known: write_report(json, known))
     print("\n".join(summary(results, out)))
     write_report(json, results)

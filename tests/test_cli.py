@@ -283,11 +283,18 @@ def test_a_place_that_cannot_be_written_to_is_named_before_anything_is_read_or_w
     [
         ["inspect", "{file}", "--json", "{file}"],
         ["inspect", "{file}", "--picture", "x.png", "--json", "sub/../x.png"],
+        ["inspect", "{file}", "--picture", "x.png", "--json", "x.html"],
+        ["inspect", "{file}", "--picture", "x.png", "--data", "{folder}", "--json", "{scene}"],
         ["export", "{file}", "--format", "npz", "--out", "{file}"],
         ["export", "{folder}", "--format", "nerfacc-grid", "--out", "{file}"],
         ["export", "{file}", "--format", "ply", "--out", "x.ply", "--json", "x.ply"],
         ["shrink", "{file}", "--data", "{folder}", "--out", "x", "--json", "{file}"],
+        ["shrink", "{file}", "--data", "{scene}", "--out", "x", "--json", "{scene}"],
         ["swap", "nerfacto", "--occupancy", "{file}", "--json", "{file}"],
+        ["swap", "nerfacto", "--occupancy", "{folder}", "--json", "{file}"],
+        ["points", "{folder}", "--json", "{scene}"],
+        ["capacity", "--data", "{folder}", "--out", "x", "--json", "{scene}"],
+        ["chart", "--data", "{folder}", "--out", "x", "--seconds", "9", "--json", "{scene}"],
     ],
 )
 def test_no_command_writes_over_what_it_reads_or_over_what_it_has_just_written(
@@ -296,7 +303,8 @@ def test_no_command_writes_over_what_it_reads_or_over_what_it_has_just_written(
     file = here / "run" / "occupancy.safetensors"
     file.parent.mkdir()
     ball().save(file)
-    before, arguments = file.read_bytes(), [part.format(file=file, folder=here) for part in command]
+    places = {"file": file, "folder": here, "scene": here / "transforms.json"}
+    before, arguments = file.read_bytes(), [part.format(**places) for part in command]
     assert run(*arguments) == 2
     assert f"leco: {command[-2]} {arguments[-1]} is a file that" in capsys.readouterr().err
     assert file.read_bytes() == before and not (here / "x.ply").exists()

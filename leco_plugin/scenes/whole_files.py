@@ -105,8 +105,9 @@ def check_place(option: str, path: Path | None) -> None:
 
 def check_apart(written: Mapping[str, Path | None], *read: Path | None) -> None:
     """InputError if a file to write, known by its option, is one that a command reads, or another
-    that it writes."""
-    taken = {path.resolve() for path in read if path is not None}
+    that it writes. Of a scene's folder the transforms.json is read."""
+    known = [path for path in read if path is not None]
+    taken = {path.resolve() for each in known for path in (each, each / "transforms.json")}
     for option, path in written.items():
         if path is None:
             continue
