@@ -102,6 +102,8 @@ def shade_in_torch(scene: Scene, rays: Rays, intervals: Intervals) -> tuple[Shad
     heard: list[Answers] = []
 
     def hear(part: Tensor) -> None:
+        if heard and not len(part):
+            return
         some = Intervals(*(values.index_select(0, part) for values in intervals))
         answers = ask(scene, rays, some, freeze_gate=True)
         lengths = (some.t_ends - some.t_starts) / scene.space.half_extent

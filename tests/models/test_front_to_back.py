@@ -21,15 +21,18 @@ from leco_plugin.models.front_to_back import (
     is_no_slower,
     samples_of,
     shade_front_to_back,
+    shade_in_torch,
     suits_native,
 )
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.hmoe import HMoEConfig
 from leco_plugin.models.rendering import (
+    Answers,
     Intervals,
     Rays,
     Routing,
     Scene,
+    ask,
     mapped_middles,
     shade,
     with_backdrop,
@@ -178,6 +181,21 @@ def test_it_asks_from_the_front_and_hardly_further_than_light_goes(density: floa
         assert float(was_asked.float().mean()) < 0.5
     if density == 0.01:
         assert bool(was_asked.all())
+
+
+@pytest.mark.parametrize("count", [0, 150])
+def test_torch_asks_no_question_about_nothing(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+
+    def counting(scene: Scene, rays: Rays, some: Intervals, freeze_gate: bool) -> Answers:
+        asked.append(len(some.t_starts))
+        return ask(scene, rays, some, freeze_gate)
+
+    monkeypatch.setattr(front_to_back, "ask", counting)
+    rays = some_rays(count)
+    shaded, seen = shade_in_torch(scene_of(3000.0), rays, kept_along(rays))
+    assert sum(asked) == len(seen.t_starts) and len(shaded.rgb) == count
+    assert 0 not in asked[1:]  # one answer gives the others their shapes
 
 
 @needs_compiler
