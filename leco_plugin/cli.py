@@ -26,7 +26,7 @@ from leco_plugin.cli_experiments import capacity, chart, check, stability
 from leco_plugin.cli_occupancy import export, inspect, shrink
 from leco_plugin.names import is_like, options_in, unknown_name
 from leco_plugin.scenes.input_error import one_line
-from leco_plugin.scenes.whole_files import check_apart, check_place, write_report
+from leco_plugin.scenes.whole_files import check_place, check_report, write_report
 
 BAD_INPUT, FAILURE = 2, 1
 FEW_PICTURES = 20
@@ -142,8 +142,7 @@ def points(
         threads: Of the CPU. 0 takes all.
         json: File for what was found, as JSON.
     """
-    check_place("--json", json)
-    check_apart({"--json": json}, data)
+    check_report(json, data)
     from leco_plugin.scenes.poses.points import find_points
 
     report = find_points(data, size, threads)
@@ -189,8 +188,7 @@ def swap(
     from leco_plugin.hosts.guided_start import occupancy_file
     from leco_plugin.swap import swapped_config
 
-    check_place("--json", json)
-    check_apart({"--json": json}, occupancy and occupancy_file(occupancy))
+    check_report(json, occupancy and occupancy_file(occupancy))
     config = swapped_config(
         method, occupancy, arguments, sampler, options, codes, other_scene, learn_seconds
     )

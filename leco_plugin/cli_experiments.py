@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from leco_plugin.scenes.whole_files import check_apart, check_place, write_report
+from leco_plugin.scenes.whole_files import check_place, check_report, write_report
 
 
 def chart(
@@ -59,8 +59,7 @@ def chart(
             says; stretch a whole flight line or arc, whose neighbours are not trained on either.
         json: Another file for the results.
     """
-    check_place("--json", json)
-    check_apart({"--json": json}, data)
+    check_report(json, data)
     from leco_plugin.chart.command import Asked, make_charts, refuse_failures
 
     asked = Asked(seconds, steps, learn_seconds, seeds, images, at_once, reuse, held_out)
@@ -137,8 +136,7 @@ def capacity(
     """
     from leco_plugin.capacity.measuring import capacity as measure
 
-    check_place("--json", json)
-    check_apart({"--json": json}, data)
+    check_report(json, data)
     results = measure(data, out, grids, lost_surface_mass, learn_steps)
     print(results["verdict"])
     print(f"see capacity.png and results.json in {out}")

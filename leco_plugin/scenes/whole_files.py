@@ -119,6 +119,12 @@ def check_apart(written: Mapping[str, Path | None], *read: Path | None) -> None:
         taken.add(path.resolve())
 
 
+def check_report(path: Path | None, *read: Path | None) -> None:
+    """InputError if a report, the file of --json, cannot be written, or is one that is read."""
+    check_place("--json", path)
+    check_apart({"--json": path}, *read)
+
+
 def check_picture(option: str, path: Path | None, moving: bool = False) -> None:
     """As `check_place`; InputError too for an unknown kind of picture. A `moving` one may be a
     .gif."""
