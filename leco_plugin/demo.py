@@ -153,8 +153,8 @@ def draw_chart(report: dict[str, Any], path: Path) -> Path:
             colour = style(0, LIGHT)["color"]
             axes.axvline(frozen, color=colour, linestyle="--", linewidth=1.4)
             known = f" what is empty\n is known after {frozen:.0f} s"
-            at = (frozen, 0.06)
-            axes.annotate(known, at, xycoords=("data", "axes fraction"), color=colour, fontsize=11)
+            place = axes.get_xaxis_transform()  # at the top, for curves rise
+            axes.text(frozen, 0.98, known, transform=place, va="top", color=colour, fontsize=11)
         return save_picture(figure, path, runs, dpi=120)
 
 
