@@ -227,10 +227,12 @@ def check_poses(poses: NDArray[np.floating], names: list[str]) -> None:
 
 
 def check_no_contradiction(poses: NDArray[np.floating], names: list[str]) -> None:
-    """InputError for a name to which two of finite poses [C, 3 or 4, 4] belong."""
+    """InputError for a name to which two of finite poses [C, 3 or 4, 4] belong, that differ by more
+    than rounding."""
     first: dict[str, int] = {}
     for number, name in enumerate(names):
-        if (poses[number] != poses[first.setdefault(name, number)]).any():
+        same = poses[first.setdefault(name, number)]
+        if not np.allclose(poses[number], same, rtol=1e-9, atol=1e-6):
             raise InputError(f"{name} is given twice, and differs: remove one of these frames")
 
 

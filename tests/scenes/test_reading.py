@@ -24,7 +24,7 @@ from nerfstudio.data.dataparsers.sdfstudio_dataparser import SDFStudioDataParser
 from PIL import Image
 from scene_files import change, described, refused, write_colmap
 
-from leco_plugin.scenes.frames import POINTS
+from leco_plugin.scenes.frames import POINTS, check_no_contradiction
 from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 from leco_plugin.scenes.reading import read_checked
@@ -262,6 +262,15 @@ def test_a_photograph_is_turned_where_its_intrinsics_are_for_that(scene: Path) -
         picture(outputs.image_filenames[row]), picture(scene / "upright.png")
     )
     assert int(outputs.cameras.width[row]) == 20 and int(outputs.cameras.height[row]) == 32
+
+
+def test_a_photograph_may_be_listed_twice_where_rounding_alone_differs() -> None:
+    poses = np.stack([np.eye(4)[:3]] * 2)
+    poses[:, :, 3] = 5e6  # as of UTM
+    poses[1] += 1e-3 * np.array([0.0, 0.0, 0.0, 1.0])
+    check_no_contradiction(poses, ["a", "a"])
+    with refused("^a is given twice, and differs"):
+        check_no_contradiction(poses - [0.0, 0.0, 0.0, 5e6], ["a", "a"])
 
 
 @pytest.mark.parametrize(
