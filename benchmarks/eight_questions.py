@@ -197,8 +197,7 @@ def _enough(charts: Sequence[Mapping[str, Any]]) -> str:
         said.append(
             f"After {results['protocol']['seconds']:g} s on `{results['scene']['name']}` "
             f"{found[0].lower()}{found[1:]}{_at_half(results)}; in the last third it gained "
-            f"{gained:.1f} dB "
-            f"([figures](suites.md#{heading_anchor(title)}))."
+            f"{gained:.1f} dB ([figures](suites.md#{heading_anchor(title)}))."
         )
     return " ".join(said)
 

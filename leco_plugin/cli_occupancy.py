@@ -57,7 +57,8 @@ def inspect(
     """
     check_place("--json", json)
     check_picture("--picture", picture)
-    check_place("--picture", None if picture is None else picture.with_suffix(PAGE))
+    page = None if picture is None else picture.with_suffix(PAGE)
+    check_place("--picture", page)
     check_picture("--history", history, moving=True)
     if picture is None and (dark or data is not None):
         raise ValueError("--data and --dark are about the picture: give --picture FILE")
@@ -66,7 +67,6 @@ def inspect(
     from leco_plugin.occupancy import Occupancy
 
     file = occupancy_of(file)
-    page = None if picture is None else picture.with_suffix(PAGE)
     written = {"--picture": picture, "the page of --picture": page, "--history": history}
     check_apart({**written, "--json": json}, file, data)
     occupancy = Occupancy.load(file)

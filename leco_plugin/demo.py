@@ -135,7 +135,7 @@ def draw_chart(report: dict[str, Any], path: Path) -> Path:
     where = describe_cores(machine) if machine["device"] == "cpu" else "one GPU"
     gain = runs[0]["psnr"] - runs[1]["psnr"]
     title = f"{gain:+.1f} dB after the same time, by skipping what is empty"
-    if blocks == QUICK[0].blocks:
+    if _is_quick(report):
         title = "All works; these figures mean nothing"
     names = ("skips what it has\nlearned is empty", "the same model,\nskipping nothing")
     lines = [Line(name, "", run["sampler"], (run,)) for name, run in zip(names, runs)]
@@ -241,6 +241,11 @@ def _draw_picture(trainer: Trainer, occupancy: Occupancy, truth: CityTruth, path
     save_whole(figure, path, dpi=160, bbox_inches="tight")
 
 
+def _is_quick(report: dict[str, Any]) -> bool:
+    """Whether it is of the city of a quick demo, whose figures mean nothing."""
+    return bool(report["scene"]["blocks"] == QUICK[0].blocks)
+
+
 def summary(report: dict[str, Any]) -> list[str]:
     """The report in a few lines, for the terminal."""
     facts = report["occupancy"]
@@ -258,7 +263,7 @@ def summary(report: dict[str, Any]) -> list[str]:
         f"{run['render_seconds_per_image']:.2f} s an image"
         for run in (guided, other)
     ]
-    if report["scene"]["blocks"] == QUICK[0].blocks:
+    if _is_quick(report):
         lines.append("all works; figures of one block and so short a time mean nothing")
     lines.append(f"all of it took {report['seconds_in_all'] / 60:.1f} minutes")
     return lines

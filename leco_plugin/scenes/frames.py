@@ -231,8 +231,8 @@ def check_no_contradiction(poses: NDArray[np.floating], names: list[str]) -> Non
     than rounding."""
     first: dict[str, int] = {}
     for number, name in enumerate(names):
-        same = poses[first.setdefault(name, number)]
-        if not np.allclose(poses[number], same, rtol=1e-9, atol=1e-6):
+        before = first.setdefault(name, number)
+        if before != number and not np.allclose(poses[number], poses[before], rtol=1e-9, atol=1e-6):
             raise InputError(f"{name} is given twice, and differs: remove one of these frames")
 
 

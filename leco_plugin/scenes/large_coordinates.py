@@ -68,6 +68,8 @@ class ReadsNear(DataParser):
     shift: Array | None = None
     """[3] taken off the positions in the files; zeros where they are near. None before reading."""
     _meta: dict[str, Any] | None = None
+    _applied: tuple[Any, float] = None, 1.0
+    """As of `applied_in`, of nerfstudio's format."""
 
     def _generate_dataparser_outputs(
         self, split: str = "train", **kwargs: Any
@@ -80,8 +82,7 @@ class ReadsNear(DataParser):
         near.__kwdefaults__ = read.__kwdefaults__
         outputs: DataparserOutputs = near(self, split, **kwargs)
         if isinstance(self, Nerfstudio):
-            folder = file_in(self.config.data).parent
-            outputs.metadata[APPLIED] = applied_in(self._meta or {}, folder)
+            outputs.metadata[APPLIED] = self._applied
         if self.shift is None or not self.shift.any():
             return outputs
         transform = torch.as_tensor(outputs.dataparser_transform).double()[:3].clone()
@@ -113,7 +114,7 @@ class ReadsNear(DataParser):
         except (KeyError, TypeError, ValueError, IndexError):
             return meta  # no poses, or none that any reader takes
         if isinstance(self, Nerfstudio):  # else it is not the same by the folder and by the file
-            applied, _ = applied_in(meta, file_in(self.config.data).parent)
+            self._applied = applied, _ = applied_in(meta, file_in(self.config.data).parent)
             meta = meta if applied is None else meta | {"applied_transform": applied}
         self._meta = meta
         if self.shift is None:

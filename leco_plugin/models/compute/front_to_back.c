@@ -48,7 +48,8 @@ typedef struct {
 /* What is known of the samples of a chunk. */
 typedef struct {
     int64_t samples[CHUNK], rays[CHUNK], routes[CHUNK], order[CHUNK];
-    float mapped[3][CHUNK], unit[CHUNK][3], factors[CHUNK], raw[CHUNK], alphas[CHUNK], weights[CHUNK];
+    float mapped[3][CHUNK], unit[CHUNK][3], factors[CHUNK], raw[CHUNK];
+    float sigmas[CHUNK], alphas[CHUNK], weights[CHUNK];
     int seen[CHUNK], lit[CHUNK]; /* lit: whether a sample, without the backdrop, is not faint */
     int places[CHUNK];           /* where the next samples of each ray are, or NOT_ASKED */
     float *encoded, *logits, *hidden;
@@ -116,11 +117,12 @@ static void ask(const Scene *scene, const Batch *batch, Chunk *chunk, int begin,
                     scene->width, scene->layers);
     for (int i = begin; i < end; i++) {
         int64_t sample = chunk->samples[i];
-        float start = batch->given_starts[sample], end = batch->given_ends[sample];
-        float sigma = expf(chunk->raw[i] - 1.0f), half = scene->half_extent;
-        float absorbing = end >= batch->ends[chunk->rays[i]] ? sigma + batch->opaque : sigma;
-        chunk->alphas[i] = -expm1f(-absorbing * (end / half - start / half));
-        chunk->lit[i] = !(-expm1f(-sigma * (end / half - start / half)) < batch->faint);
+        float from = batch->given_starts[sample], to = batch->given_ends[sample];
+        float length = to / scene->half_extent - from / scene->half_extent;
+        float sigma = chunk->sigmas[i] = expf(chunk->raw[i] - 1.0f), alpha = -expm1f(-sigma * length);
+        int is_backdrop = to >= batch->ends[chunk->rays[i]];
+        chunk->lit[i] = !(alpha < batch->faint);
+        chunk->alphas[i] = is_backdrop ? -expm1f(-(sigma + batch->opaque) * length) : alpha;
     }
 }
 
@@ -179,7 +181,7 @@ static int weigh(const Scene *scene, const Batch *batch, Chunk *chunk, Front *fr
     batch->t_starts[to] = start;
     batch->t_ends[to] = end;
     batch->weights[to] = chunk->weights[i] = weight;
-    batch->sigmas[to] = expf(chunk->raw[i] - 1.0f);
+    batch->sigmas[to] = chunk->sigmas[i];
     batch->routes[to] = chunk->routes[i];
     memcpy(batch->logits + to * scene->outputs, chunk->logits + (int64_t)i * scene->outputs,
            scene->outputs * sizeof(float));
