@@ -124,6 +124,33 @@ def poses(
     write_report(json, report)
 
 
+def rays(
+    records: Annotated[Path, tyro.conf.Positional],
+    out: Path,
+    json: Path | None = None,
+) -> None:
+    """Write Block-NeRF's records, which have a ray for each pixel, as a scene to train on.
+
+    Fits a lens to the rays of each camera and a pose to those of each picture, and says how far
+    they are off. Moving things, which the records of validation pictures mark, are not left out. A
+    killed run resumes when the same command is typed again.
+
+    Args:
+        records: Folder of the records, *train.tfrecord* and *validation.tfrecord*, compressed with
+            gzip. The latter are for testing.
+        out: Folder of the scene: pictures and transforms.json.
+        json: File for what was fitted, as JSON.
+    """
+    check_place("--json", json)
+    from leco_plugin.scenes.block_nerf import make_scene, summary
+
+    report = make_scene(records, out)
+    print("\n".join(summary(report)))
+    print(f"find its surfaces with: {shlex.join(['leco', 'points', str(out)])}")
+    print(f"train on it with: {_training(out)}")
+    write_report(json, report)
+
+
 def points(
     data: Annotated[Path, tyro.conf.Positional],
     size: int = 1600,
@@ -233,7 +260,10 @@ def _training(data: Path, *reader: str) -> str:
     return shlex.join(["ns-train", "leco-occupancy", *reader, "--data", str(data)])
 
 
-LISTED = city, poses, points, inspect, export, shrink, capacity, swap, demo, chart, stability, check
+LISTED = (
+    *(city, poses, rays, points, inspect, export, shrink, capacity),
+    *(swap, demo, chart, stability, check),
+)
 COMMANDS: dict[str, Callable[..., None]] = {command.__name__: command for command in LISTED}
 
 
