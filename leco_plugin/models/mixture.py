@@ -28,7 +28,7 @@ from leco_plugin.models.rendering import (
     weigh,
     with_backdrop,
 )
-from leco_plugin.models.sizing.sizes import SIZES, Sizes, from_stored, to_store
+from leco_plugin.models.sizing.sizes import SIZES, Sizes, check, from_stored, to_store
 from leco_plugin.occupancy import SHOWN, Occupancy, Precision, gate_precision
 from leco_plugin.samplers import marching
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
@@ -93,6 +93,7 @@ class Mixture(nn.Module):
         self._estimator: tuple[LearnedOccupancyEstimator, ...] = ()
 
     def _build(self, sizes: Sizes, num_images: int) -> None:
+        check(sizes)
         self.sizes, self.num_images = sizes, num_images
         self.gate = Gate(sizes.gate)
         self.field = HMoEField(sizes.field, num_images)

@@ -155,7 +155,7 @@ def _has_points(model: Path) -> bool:
     """Whether a model of COLMAP may have points: False where their file is not there, or whole and
     of none."""
     if (file := model / "points3D.bin").exists():
-        return file.stat().st_size != COUNT_BYTES
+        return file.stat().st_size != COUNT_BYTES or any(file.read_bytes())
     if not (file := model / "points3D.txt").exists():
         return False
     with file.open("rb") as lines:

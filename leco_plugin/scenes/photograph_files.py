@@ -16,6 +16,7 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
+from unicodedata import normalize
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,8 +112,10 @@ def _orientation(image: Image.Image) -> int:
 
 
 def find_file(path: Path) -> Path:
-    """A file of that name, of its name with slashes, or of one of these with an ending."""
-    for name in (str(path), str(path).replace("\\", "/")):
+    """A file of that name, of its name with slashes or with letters and accents joined or apart, as
+    systems store them, or of one of these with an ending."""
+    slashed = str(path).replace("\\", "/")
+    for name in (str(path), slashed, normalize("NFC", slashed), normalize("NFD", slashed)):
         for ending in ("", ".png", ".jpg", ".jpeg", ".JPG"):
             if os.path.isfile(name + ending):  # pathlib raises for a name that is too long
                 return Path(name + ending)

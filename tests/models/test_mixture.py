@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 import torch
 from small_learner import SMALLEST, small_mixture
 
@@ -18,6 +19,11 @@ def test_learning_marches_as_coarsely_as_it_has_fewer_candidates() -> None:
     mixture.set_bounds(BOUNDS, median_length=2.0)
     fine, coarse = mixture.rule(), mixture.rule(coarse=True)
     assert coarse.step_size > 3.0 * fine.step_size > 0.0
+
+
+def test_a_gate_of_more_experts_than_its_field_is_refused() -> None:
+    with pytest.raises(ValueError, match="sends points to 8 scene experts and the field has 4"):
+        small_mixture(replace(SMALLEST, gate=replace(SMALLEST.gate, scene_experts=8)))
 
 
 def test_a_frozen_gate_of_a_checkpoint_does_not_learn_again() -> None:

@@ -15,13 +15,13 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from PIL import Image
+from scene_files import described, refused
 from scipy.spatial.transform import Rotation
 
 from leco_plugin.cli import main
 from leco_plugin.scenes.block_nerf import make_scene
 from leco_plugin.scenes.city.cameras import look_at
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
-from tests.scene_files import described, refused
 
 WIDTH, HEIGHT = 72, 48
 BENT = (0.08, -0.03, 0.002, -0.003)

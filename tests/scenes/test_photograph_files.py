@@ -7,6 +7,7 @@ import struct
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
+from unicodedata import normalize
 
 import numpy as np
 import pytest
@@ -162,6 +163,8 @@ def test_names_as_windows_and_instant_ngp_write_them_are_found(tmp_path: Path) -
     for name in ("images/a.png", "images\\a.png", "images/a", "images\\a"):
         assert find_file(tmp_path / name) == path
         check_images([find_file(tmp_path / name)])
+    path = write(tmp_path / "images" / normalize("NFD", "é.png"), "RGB")
+    assert find_file(tmp_path / "images" / "é") == path
     with refused(r"1 of 1 image is not there.*written by Windows.*backslash"):
         check_images([find_file(tmp_path / "images\\b.png")])
 

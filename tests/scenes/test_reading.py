@@ -579,9 +579,10 @@ def test_a_model_of_colmap_may_have_no_points(left: bytes | None, scene: Path) -
     assert (POINTS in outputs.metadata) == bool(left and left[:1] == b"1")
     (scene / "sparse/0/points3D.bin").write_bytes(bytes(8))
     assert POINTS not in read(config).metadata
-    (scene / "sparse/0/points3D.bin").write_bytes(bytes(3))  # cut off
-    with refused(r"mend .*sparse/0$"):
-        read(config)
+    for cut_off in (bytes(3), bytes([5, *bytes(7)])):  # after the number of its points
+        (scene / "sparse/0/points3D.bin").write_bytes(cut_off)
+        with refused(r"mend .*sparse/0$"):
+            read(config)
 
 
 @pytest.mark.parametrize(

@@ -114,8 +114,12 @@ def _digest(value: Any) -> str:
 
 
 def _read(file: Path) -> dict[str, Any] | None:
-    """What a file of JSON says; None where there is none."""
-    return json.loads(file.read_text()) if file.is_file() else None
+    """What a file of JSON says; None where there is none. InputError for a damaged one."""
+    try:
+        return json.loads(file.read_text()) if file.is_file() else None
+    except ValueError as error:
+        fault = f"{file} is damaged ({one_line(error, 80)})"
+        raise InputError(f"{fault}: give another folder with --out, or delete this one") from None
 
 
 def _finished(out: Path, asked: dict[str, Any]) -> dict[str, Any] | None:

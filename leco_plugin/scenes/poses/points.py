@@ -36,7 +36,8 @@ from leco_plugin.scenes.whole_files import check_place, write_json, write_whole
 
 Array = NDArray[np.float64]
 FILE, BEFORE = "leco_points.ply", "transforms.before_points.json"
-"""The points, and transforms.json as it was, in the folder of the scene."""
+"""The points, and transforms.json as it was, in the folder of the scene; the name of another
+description goes before these."""
 TOLERANCE = 0.01
 """Share of a picture's longest side by which a feature may miss its point; COLMAP has 4 pixels."""
 NO_POINTS = "undistort the photographs, or give bounds.altitudes, or near and far, without points"
@@ -67,7 +68,8 @@ def find_points(data: Path, size: int = 1600, threads: int = 0) -> dict[str, Any
         few = counted(len(chosen), "photograph")
         raise InputError(f"{scene.path} has {few}; {FEWEST} or more are needed")
     load_pycolmap()
-    check_place("--data", scene.path.with_name(FILE))
+    file = _beside(scene.path, FILE)
+    check_place("--data", file)
     poses = poses_in(scene.frames)[chosen, :3]
     centre = poses[:, :, 3].mean(axis=0)  # pycolmap loses digits of coordinates like UTM's
     poses[:, :, 3] -= centre
@@ -83,9 +85,8 @@ def find_points(data: Path, size: int = 1600, threads: int = 0) -> dict[str, Any
         model = _triangulate(reconstructor, cameras, poses)
         _refuse_few(model, matched_features(reconstructor), scene.path)
     places, colours = points_of(model)
-    file = scene.path.with_name(FILE)
     write_sparse_points(file, places + centre, colours)
-    _name_points(scene.path)
+    _name_points(scene.path, file.name)
     return report | {"points": len(places), "file": str(file), "done": True}
 
 
@@ -228,10 +229,15 @@ def camera_of(lens: Lens, full: tuple[int, int], size: tuple[int, int], where: s
     )
 
 
-def _name_points(path: Path) -> None:
-    """Has a transforms.json name the points; the file as it was stays beside it."""
-    before, kept = path.read_bytes(), path.with_name(BEFORE)
+def _beside(path: Path, name: str) -> Path:
+    """A file beside a transforms.json, or beside another description of the folder's scenes."""
+    return path.with_name(name if path.name == "transforms.json" else f"{path.stem}.{name}")
+
+
+def _name_points(path: Path, file: str) -> None:
+    """Has a description of a scene name the points; it stays as it was under another name."""
+    before, kept = path.read_bytes(), _beside(path, BEFORE)
     if not kept.exists():
         write_whole(kept, lambda file: file.write(before))
-    meta = json.loads(before.decode("utf-8-sig")) | {"ply_file_path": FILE}
+    meta = json.loads(before.decode("utf-8-sig")) | {"ply_file_path": file}
     write_json(path, meta, indent=1, allow_nan=True)

@@ -256,6 +256,10 @@ def test_a_folder_with_something_else_is_refused_before_any_work(
 ) -> None:
     with pytest.raises(InputError, match="holds something else: give another folder"):
         make_scene(photos, tiny_scene)
+    (tiny_scene / "colmap").mkdir()
+    (tiny_scene / "colmap" / "asked.json").write_text('{"format"')
+    with pytest.raises(InputError, match=r"asked\.json is damaged .*: give another folder"):
+        make_scene(photos, tiny_scene)
 
 
 def test_without_pycolmap_one_line_says_how_to_install_it(

@@ -96,9 +96,14 @@ def test_what_is_hidden_gets_no_points(few: Path, hidden_by: str) -> None:
                 image.putalpha(shown)
                 frame["file_path"] = f"{number}.png"
                 image.save(bare / frame["file_path"])
-    (bare / "transforms.json").write_text(json.dumps(meta))
-    find_points(bare, threads=1)
-    points = (read_ply(bare / FILE, torch.float64) - torch.from_numpy(FAR_AWAY)).numpy()
+    before = (bare / "transforms.json").read_bytes()
+    (bare / "hidden.json").write_text(json.dumps(meta))
+    find_points(bare / "hidden.json", threads=1)  # what it writes is its own
+    file = bare / f"hidden.{FILE}"
+    assert json.loads((bare / "hidden.json").read_text())["ply_file_path"] == file.name
+    assert json.loads((bare / f"hidden.{BEFORE}").read_text()) == meta
+    assert (bare / "transforms.json").read_bytes() == before and not (bare / FILE).exists()
+    points = (read_ply(file, torch.float64) - torch.from_numpy(FAR_AWAY)).numpy()
     seen = np.zeros(len(points), dtype=int)
     for frame in meta["frames"]:
         pose = np.array(frame["transform_matrix"])
