@@ -24,6 +24,8 @@ GAIN_CHART = "caliterra-hosts"
 """Each host with its own sampling and with a learned occupancy, in benchmarks/results/charts."""
 HALF_HOUR_CHARTS = {"a drone survey": "caliterra-half-hour", "a city": "city-4-half-hour"}
 """Runs of half an hour, by the kind of scene; the first is the scene of the gain."""
+FIVE_MINUTES = "-ngp-300"
+"""How the names of charts of Instant-NGP end whose runs had 300 s."""
 GIFTS_CHART = "caliterra-gifts"
 """A host with a learned occupancy, with and without what else it gets, and with its own grid."""
 OURS = "leco-occupancy"
@@ -105,6 +107,24 @@ def half_an_hour() -> str:
         f"**After half an hour** of one core LeCO has {'; '.join(parts)}. In brackets behind each "
         "PSNR what the last third of the time brought."
     )
+
+
+def after_five_minutes() -> str:
+    """How Instant-NGP stands beside its other rows after 300 s, scene by scene; nothing where no
+    such chart is stored."""
+    charts = {name: stored(name) for name in titles() if name.endswith(FIVE_MINUTES)}
+    parts = []
+    for name, results in charts.items():
+        ours, *rivals = sorted(lines_of(results), key=lambda line: (not line.learned, -line.psnr))
+        beside = " and ".join(_beside(ours, rival, "Instant-NGP") for rival in rivals)
+        clear = min(ours.psnrs) > max(psnr for rival in rivals for psnr in rival.psnrs)
+        parts.append(
+            f"on `{results['scene']['name']}` {ours.psnr:.1f} dB "
+            f"([figures](measurements.md#{heading_anchor(titles()[name])})){star(name)}, {beside}"
+            + ("; each seed is ahead of each of theirs" if clear else "")
+        )
+    given = " and ".join(dict.fromkeys(describe_seeds(results) for results in charts.values()))
+    return f"**After 300 s** Instant-NGP has ({given}) {'; '.join(parts)}." if parts else ""
 
 
 def without_gifts(results: Mapping[str, Any]) -> str:

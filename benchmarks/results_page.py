@@ -36,6 +36,7 @@ from promises import kept_promises, promises_section
 from readme_parts import (
     GAIN_CHART,
     GIFTS_CHART,
+    after_five_minutes,
     demo_table,
     gain,
     gains,
@@ -85,6 +86,8 @@ nerfstudio's: a hash table of 2^16 entries, a grid of 64³, 128 + 64 proposal sa
 field.
 
 {stretch}
+
+{five_minutes}
 
 {half_hour}
 
@@ -293,7 +296,11 @@ def page() -> str:
     anchor = heading_anchor(titles()[GAIN_CHART])
     gifts = gifts_sentence(stored(GIFTS_CHART), heading_anchor(titles()[GIFTS_CHART]))
     note = GAIN_NOTE.format(
-        anchor=anchor, gifts=gifts, stretch=new_views(), half_hour=half_an_hour()
+        anchor=anchor,
+        gifts=gifts,
+        stretch=new_views(),
+        five_minutes=after_five_minutes(),
+        half_hour=half_an_hour(),
     )
     parts = [HEAD, f"{gain()}\n", f"{picture(GAIN_CHART)}\n", note]
     parts += [

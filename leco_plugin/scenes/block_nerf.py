@@ -1,19 +1,17 @@
 """`leco rays`: from the records of Block-NeRF, a ray for each pixel, to a scene with cameras.
 
 The records of Mission Bay (https://waymo.com/research/block-nerf) give neither lens nor pose. A
-lens is fitted to the rays of each camera's first picture, then a rotation to those of each picture.
+lens is fitted to rays of some pictures of each camera, then a rotation to those of each picture.
 """
 
 from __future__ import annotations
 
 import gzip
 import io
-import json
 import shutil
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -36,29 +34,27 @@ INTRINSICS = ("fl_x", "fl_y", "cx", "cy")
 DISTORTION = ("k1", "k2", "p1", "p2")
 ACROSS, DOWN = 32, 24
 """Rays of a picture that its camera is fitted to."""
+LENSES = 16
+"""Pictures of a camera to which a lens is fitted. That of the best is kept: a car that turns while
+a picture is read out bends its rays."""
 STRAIGHT = 0.1
 """Pixels (root mean square) within which a lens is fitted without distortion."""
 NO_CAMERA = 0.05
 """Of the width: rays that are farther from every lens are those of no such camera."""
 LONGEST = 1 << 31
 """Bytes of a record: none has more."""
+CLOSE = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
+"""When to end undoing distortion, step by step."""
 
 
-@dataclass(frozen=True)
-class Picture:
-    """A record: a picture and its rays, some of them."""
-
-    name: str
-    camera: int
-    size: tuple[int, int]
-    """Width and height."""
-    png: bytes
-    pixels: Array
-    """[R, 2] middles of pixels, x and y."""
-    origins: Array
-    """[R, 3] in units of the records."""
-    directions: Array
-    """[R, 3] of length 1."""
+RAYS = np.dtype(
+    [
+        *(("name", "U40"), ("camera", "i8"), ("width", "i8"), ("height", "i8"), ("test", "?")),
+        *(("place", "f8", 3), ("moved", "f8"), ("directions", "f4", (ACROSS * DOWN, 3))),
+    ]
+)
+"""Of a picture: the mean of its rays' origins, in units of the records, how far one of them is from
+there at most, and directions of length 1 of the rays of ACROSS x DOWN of its pixels."""
 
 
 def make_scene(records: Path, out: Path) -> dict[str, Any]:
@@ -66,33 +62,23 @@ def make_scene(records: Path, out: Path) -> dict[str, Any]:
     what a killed run has left. InputError for other files, or an `out` with a scene."""
     require_folder(records, "give that of the records, *.tfrecord*")
     files = sorted(path for path in records.rglob("*.tfrecord*") if path.is_file())
-    if all(_is_validation(path) for path in files):
+    if all("validation" in path.name for path in files):
         raise InputError(f"{records} has no records to train on, *train.tfrecord*")
     with alone_in(out, "scene"), resumable(), bar("Reading the records") as show:
         if (out / SCENE).exists():
             raise InputError(f"--out {out} holds a scene already: give another folder")
-        read: list[dict[str, Any]] = []
-        lenses: dict[str, dict[str, float]] = {}
+        found = []
         for number, path in enumerate(files):
-            part = out / READ / f"{path.relative_to(records)}.json"
-            found = json.loads(part.read_text()) if part.is_file() else _read(path, out, lenses)
-            lenses |= found["lenses"]
-            write_json(part, found)
-            read += [each | {"test": _is_validation(path)} for each in found["pictures"]]
+            kept = out / READ / f"{path.relative_to(records)}.npy"
+            if kept.is_file():
+                found.append(np.load(kept))
+            else:
+                found.append(np.array([*_read(path, out)], dtype=RAYS))
+                write_whole(kept, lambda file, rays=found[-1]: np.save(file, rays))  # type: ignore[misc]
             show((number + 1) / len(files))
-        _write_scene(out, read)
+        report = _write_scene(out, np.sort(np.concatenate(found), order="name"))
         shutil.rmtree(out / READ)
-    errors = [each["error"] for each in read]
-    worst = read[int(np.argmax(errors))]
-    return {
-        "format": 1,
-        "pictures": len(read),
-        "test_pictures": sum(each["test"] for each in read),
-        "cameras": len(lenses),
-        "error": {"median": float(np.median(errors)), "worst": worst["error"]},
-        "worst": worst["frame"]["file_path"],
-        "moved": max(each["moved"] for each in read),
-    }
+    return report
 
 
 def summary(report: dict[str, Any]) -> Iterator[str]:
@@ -104,95 +90,103 @@ def summary(report: dict[str, Any]) -> Iterator[str]:
     yield f"rays of one picture begin up to {report['moved']:.3g} from its camera's place"
 
 
-def _is_validation(path: Path) -> bool:
-    return "validation" in path.name
-
-
-def _read(path: Path, out: Path, known: dict[str, dict[str, float]]) -> dict[str, Any]:
-    """Writes the pictures of a file; returns their frames, and the lenses that were not known."""
-    lenses: dict[str, dict[str, float]] = {}
-    pictures = []
-    for picture in _pictures(path):
-        key = f"{picture.camera} {picture.size}"
-        lens = known.get(key) or lenses.get(key) or fit_lens(picture)
-        if key not in known:
-            lenses[key] = lens
-        pose, error = fit_pose(picture, lens)
-        file = f"images/{picture.name}.png"
-        write_whole(out / file, lambda to, png=picture.png: to.write(png))  # type: ignore[misc]
-        frame = {"file_path": file, **lens, "transform_matrix": pose.tolist()}
-        moved = float(np.linalg.norm(picture.origins - pose[:3, 3], axis=1).max())
-        pictures.append({"frame": frame, "error": error, "moved": moved})
-    return {"lenses": lenses, "pictures": pictures}
-
-
-def _write_scene(out: Path, read: list[dict[str, Any]]) -> None:
-    """Writes transforms.json, its frames in the order of cameras and names."""
-    read = sorted(read, key=lambda each: each["frame"]["file_path"])
+def _write_scene(out: Path, pictures: NDArray[Any]) -> dict[str, Any]:
+    """Fits cameras to the rays of pictures [P], and writes transforms.json; returns the report."""
+    kinds = [(int(each["camera"]), int(each["width"])) for each in pictures]
+    lenses = {kind: best_lens(pictures[[k == kind for k in kinds]]) for kind in sorted({*kinds})}
+    frames, errors = [], []
+    for kind, rays in zip(kinds, pictures):
+        pose, error = fit_pose(rays, lenses[kind])
+        file = f"images/{rays['name']}.png"
+        frames.append({"file_path": file, **lenses[kind], "transform_matrix": pose.tolist()})
+        errors.append(error)
     meta: dict[str, Any] = {"camera_model": "OPENCV"}
-    if any(each["test"] for each in read):  # else every eighth picture is for testing
+    if pictures["test"].any():  # else every eighth picture is for testing
         for split in ("train", "val", "test"):
-            chosen = [each["frame"] for each in read if each["test"] == (split != "train")]
-            meta[f"{split}_filenames"] = [frame["file_path"] for frame in chosen]
-    meta["frames"] = [each["frame"] for each in read]
-    write_json(out / SCENE, meta, indent=1)
+            chosen = pictures["test"] == (split != "train")
+            meta[f"{split}_filenames"] = [f["file_path"] for f, of in zip(frames, chosen) if of]
+    write_json(out / SCENE, meta | {"frames": frames}, indent=1)
+    return {
+        "format": 1,
+        "pictures": len(pictures),
+        "test_pictures": int(pictures["test"].sum()),
+        "cameras": len(lenses),
+        "error": {"median": float(np.median(errors)), "worst": max(errors)},
+        "worst": frames[int(np.argmax(errors))]["file_path"],
+        "moved": float(pictures["moved"].max()),
+    }
 
 
-def fit_lens(picture: Picture) -> dict[str, float]:
-    """The lens of a picture's rays, as transforms.json has it: without distortion where that is
-    within a tenth of a pixel. InputError if no lens comes near."""
-    width, height = picture.size
-    ends = picture.directions.reshape(DOWN, ACROSS, 3)
-    pixels = picture.pixels.reshape(DOWN, ACROSS, 2)
+def best_lens(pictures: NDArray[Any]) -> dict[str, float]:
+    """The lens of a camera, as transforms.json has it: of those that are fitted to some of its
+    pictures, that with the least error. InputError if none comes near."""
+    some = np.unique(np.linspace(0, len(pictures) - 1, LENSES).astype(int))
+    lens, error = min((fit_lens(pictures[each]) for each in some), key=lambda found: found[1])
+    fault = ""
+    if not error <= NO_CAMERA * lens["w"]:
+        fault = f"are {error:.0f} pixels from every lens"
+    elif min(lens["fl_x"], lens["fl_y"]) <= 0.0:
+        fault = "are those of a mirrored picture"
+    if fault:
+        remedy = "no camera with distortion k1, k2, p1, p2 has them"
+        raise InputError(f"the rays of {pictures[0]['name']} {fault}: {remedy}")
+    return lens
+
+
+def fit_lens(rays: np.void) -> tuple[dict[str, float], float]:
+    """The lens of a picture's rays, and how far it is from them in pixels (root mean square);
+    without distortion where that is within a tenth of a pixel."""
+    width, height = int(rays["width"]), int(rays["height"])
+    pixels, directions = _pixels(width, height), rays["directions"].astype(float)
+    ends, places = directions.reshape(DOWN, ACROSS, 3), pixels.reshape(DOWN, ACROSS, 2)
     y, x = DOWN // 2, ACROSS // 2
     focal = [
-        np.linalg.norm(pixels[far] - pixels[y, x]) / np.linalg.norm(ends[far] - ends[y, x])
+        np.linalg.norm(places[far] - places[y, x]) / np.linalg.norm(ends[far] - ends[y, x])
         for far in ((y, x + 1), (y + 1, x))
     ]
     first = np.array([*focal, width / 2, height / 2])
-    rays = _unit(_through(picture.pixels, first, np.zeros(4)))
-    turn = _turn_to(rays, picture.directions).inv().as_rotvec()
+    turn = _turn_to(_through(pixels, first, np.zeros(4)), directions).inv().as_rotvec()
 
     def missed(values: Array) -> Array:
         """Pixels between where rays come from and where this camera has them, one after another."""
         matrix, distortion = _matrix(values[3:7]), values[7:]
-        places = picture.directions[:, None]
-        seen = cv2.projectPoints(places, values[:3], np.zeros(3), matrix, distortion)[0]
-        return np.asarray((seen.reshape(-1, 2) - picture.pixels).ravel(), dtype=float)
+        seen = cv2.projectPoints(directions, values[:3], np.zeros(3), matrix, distortion)[0]
+        return np.asarray((seen.reshape(-1, 2) - pixels).ravel(), dtype=float)
 
     scale = np.array([1.0] * 3 + [float(width)] * 4)
     fitted = least_squares(missed, np.concatenate([turn, first]), x_scale=scale)
     if _apart(fitted.fun.reshape(-1, 2)) > STRAIGHT:
         start = np.append(fitted.x, np.zeros(len(DISTORTION)))
         fitted = least_squares(missed, start, x_scale=np.append(scale, np.ones(len(DISTORTION))))
-    error = _apart(fitted.fun.reshape(-1, 2))
-    fault = f"are {error:.0f} pixels from every lens" if not error <= NO_CAMERA * width else ""
-    if min(fitted.x[3:5]) <= 0.0:
-        fault = fault or "are those of a mirrored picture"
-    if fault:
-        remedy = "no camera with distortion k1, k2, p1, p2 has them"
-        raise InputError(f"the rays of {picture.name} {fault}: {remedy}")
-    lens = dict(zip(INTRINSICS, map(float, fitted.x[3:7])))
-    return {"w": width, "h": height, **lens, **dict(zip(DISTORTION, map(float, fitted.x[7:])))}
+    lens = dict(zip((*INTRINSICS, *DISTORTION), map(float, fitted.x[3:])))
+    return {"w": width, "h": height, **lens}, _apart(fitted.fun.reshape(-1, 2))
 
 
-def fit_pose(picture: Picture, lens: dict[str, float]) -> tuple[Array, float]:
+def fit_pose(rays: np.void, lens: dict[str, float]) -> tuple[Array, float]:
     """The pose [4, 4] of a picture, OpenGL camera to world, and how far its rays are from those of
     that camera, in pixels (root mean square)."""
     values = np.array([lens[name] for name in INTRINSICS])
     distortion = np.array([lens.get(name, 0.0) for name in DISTORTION])
-    rays = _unit(_through(picture.pixels, values, distortion))
-    turn = _turn_to(rays, picture.directions)
+    own = _through(_pixels(int(rays["width"]), int(rays["height"])), values, distortion)
+    turn = _turn_to(own, rays["directions"])
     pose = np.eye(4)
     pose[:3, :3] = turn.as_matrix() * [1.0, -1.0, -1.0]
-    pose[:3, 3] = picture.origins.mean(axis=0)
-    return pose, _apart((turn.apply(rays) - picture.directions) * values[:2].mean())
+    pose[:3, 3] = rays["place"]
+    return pose, _apart((turn.apply(own) - rays["directions"]) * values[:2].mean())
+
+
+def _pixels(width: int, height: int) -> Array:
+    """[R, 2] middles of the pixels whose rays are read, x and y."""
+    x, y = (np.linspace(0, n - 1, c).round() + 0.5 for n, c in ((width, ACROSS), (height, DOWN)))
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
 def _through(pixels: Array, intrinsics: Array, distortion: Array) -> Array:
-    """Directions [R, 3] through pixels [R, 2], in OpenCV's axes: right, down, forward."""
-    points = cv2.undistortPoints(pixels.reshape(-1, 1, 2), _matrix(intrinsics), distortion)
-    return np.column_stack([points.reshape(-1, 2), np.ones(len(pixels))])
+    """Directions [R, 3] of length 1 through pixels [R, 2], in OpenCV's axes: right, down,
+    forward."""
+    matrix, eye = _matrix(intrinsics), np.eye(3)
+    points = cv2.undistortPointsIter(pixels[:, None], matrix, distortion, eye, eye, CLOSE)
+    return _unit(np.column_stack([points.reshape(-1, 2), np.ones(len(pixels))]))
 
 
 def _matrix(intrinsics: Array) -> Array:
@@ -214,46 +208,50 @@ def _apart(offsets: Array) -> float:
     return float(np.sqrt(np.mean(np.sum(offsets**2, axis=-1))))
 
 
-def _pictures(path: Path) -> Iterator[Picture]:
-    """The pictures of a file. InputError for a file that holds something else."""
+def _read(path: Path, out: Path) -> Iterator[tuple[Any, ...]]:
+    """Writes the pictures of a file; yields a row of `RAYS` for each. InputError for a file that
+    holds something else."""
     try:
         with gzip.open(path) as file:
             while head := file.read(12):  # the length, and a sum of it: gzip has its own
                 (length,) = struct.unpack("<Q", head[:8])
                 if length > LONGEST:
                     raise ValueError(f"a record of {length} bytes")
-                yield _picture(_fields(file.read(length)))
+                name, png, *row = _picture(_fields(file.read(length)))
+                write_whole(out / f"images/{name}.png", lambda to, png=png: to.write(png))  # type: ignore[misc]
+                yield (name, *row[:3], "validation" in path.name, *row[3:])
                 file.read(4)
-    except InputError:
-        raise
-    except (OSError, EOFError, ValueError, KeyError, struct.error, zlib.error) as error:
+    except (EOFError, ValueError, KeyError, struct.error, zlib.error, gzip.BadGzipFile) as error:
         said = f"{type(error).__name__}: {one_line(error, 80)}"
         raise InputError(f"{path} is no file of Block-NeRF's records ({said})") from None
 
 
-def _picture(fields: dict[str, list[memoryview]]) -> Picture:
-    """A picture of its record's fields. ValueError or KeyError if one is missing or wrong."""
+def _picture(fields: dict[str, list[memoryview]]) -> tuple[Any, ...]:
+    """Name, file, camera, width, height, place, movement and directions of a picture by its
+    record's fields. ValueError or KeyError if one is missing or wrong."""
     camera, known, width, height = (
         _varint(fields[name][0])[0] for name in ("cam_idx", "image_hash", "width", "height")
     )
     png = bytes(fields["image"][0])
-    with Image.open(io.BytesIO(png)) as image:
-        if image.size != (width, height) or min(image.size) < ACROSS:
-            raise ValueError(f"a picture of {image.size} pixels for {width} x {height} rays")
-    x, y = (
-        np.linspace(0, n - 1, c).round().astype(int) for n, c in ((width, ACROSS), (height, DOWN))
-    )
-    places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    rays = [
-        np.frombuffer(fields[name][0], "<f4").reshape(height, width, 3)[places[:, 1], places[:, 0]]
+    try:
+        with Image.open(io.BytesIO(png)) as image:
+            size = image.size
+    except OSError as error:
+        raise ValueError(str(error)) from None
+    if size != (width, height) or min(size) < ACROSS:
+        raise ValueError(f"a picture of {size[0]} x {size[1]} for {width} x {height} rays")
+    x, y = _pixels(width, height).astype(int).T
+    origins, directions = (
+        np.frombuffer(fields[name][0], "<f4").reshape(height, width, 3)[y, x].astype(float)
         for name in ("ray_origins", "ray_dirs")
-    ]
-    origins, directions = (each.astype(float) for each in rays)
+    )
     lengths = np.linalg.norm(directions, axis=1)
     if not (np.isfinite(origins).all() and np.isfinite(lengths).all() and lengths.all()):
         raise ValueError("rays that are not finite, or of length 0")
+    place = origins.mean(axis=0)
+    moved = np.linalg.norm(origins - place, axis=1).max()
     name = f"cam{camera:02d}_{known:016x}"
-    return Picture(name, camera, (width, height), png, places + 0.5, origins, _unit(directions))
+    return name, png, camera, width, height, place, moved, _unit(directions)
 
 
 def _fields(record: bytes) -> dict[str, list[memoryview]]:

@@ -38,6 +38,8 @@ class Shot:
     bent: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     drift: float = 0.0
     """How far its camera moves while a picture is read out, from above to below."""
+    turning: float = 0.0
+    """Degrees by which it turns to the left meanwhile."""
     other: dict[str, bytes] = field(default_factory=dict)
     """Fields that replace those it has."""
 
@@ -61,7 +63,10 @@ class Shot:
         )
         rays = camera.generate_rays(0)
         down = np.linspace(-0.5, 0.5, HEIGHT)[:, None, None] * [self.drift, 0.0, 0.0]
-        return rays.origins.numpy() + down, rays.directions.numpy()
+        angles = np.linspace(-0.5, 0.5, HEIGHT) * np.deg2rad(self.turning)
+        turns = Rotation.from_rotvec(np.outer(angles, [0.0, 0.0, 1.0])).as_matrix()
+        directions = np.einsum("yij,yxj->yxi", turns, rays.directions.numpy())
+        return rays.origins.numpy() + down, directions
 
     def record(self) -> bytes:
         """A tf.train.Example."""
@@ -181,6 +186,20 @@ def test_a_camera_that_moves_is_said(tmp_path: Path, capsys: pytest.CaptureFixtu
     )
 
 
+def test_a_car_that_turns_bends_no_lens_of_its_other_pictures(tmp_path: Path) -> None:
+    shots = [Shot(known=1, turning=2.0), Shot(known=2, place=(6.0, 0.0, 2.0)), Shot(known=3)]
+    write(tmp_path / "records", "train.tfrecord", *shots)
+    report = make_scene(tmp_path / "records", tmp_path / "scene")
+    assert report["worst"].endswith("01.png") and report["error"]["worst"] > 0.2
+    assert report["error"]["median"] < 0.01
+    for frame, shot in zip(described(tmp_path / "scene")["frames"], shots):
+        fitted = [frame[name] for name in ("fl_x", "fl_y", "cx", "cy")]
+        np.testing.assert_allclose(fitted, shot.intrinsics(), atol=0.02)
+        off = np.array(frame["transform_matrix"])[:3] - shot.pose()
+        half = np.deg2rad(shot.turning) / 2  # of the shear, at most, is a roll
+        assert np.abs(off).max() < half + 1e-4
+
+
 def test_a_killed_run_goes_on(
     records: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -224,7 +243,7 @@ def _behind() -> dict[str, bytes]:
         ({"ray_dirs": _floats(np.ones(5))}, "cannot reshape"),
         ({"ray_dirs": b""}, "KeyError: 'ray_dirs'"),
         ({"image": _message((1, _message((1, picture(0, 70)))))}, "for 72 x 48 rays"),
-        ({"image": _message((1, _message((1, b"none"))))}, "UnidentifiedImageError"),
+        ({"image": _message((1, _message((1, b"none"))))}, "cannot identify image file"),
     ],
     ids=["mirrored", "panorama", "zero", "nan", "infinite", "few", "none", "size", "no-image"],
 )
