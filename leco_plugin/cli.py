@@ -161,7 +161,8 @@ def points(
 
     Runs COLMAP on the CPU, by pycolmap, which the extra `poses` installs, from the poses and
     lenses of the scene, which stay as they are. Writes leco_points.ply into the scene and names it
-    in transforms.json. The file as it was stays beside it as transforms.before_points.json.
+    in transforms.json. The file as it was stays beside it as transforms.before_points.json. Of
+    another file, NAME.json, all that is written begins with its name.
 
     Args:
         data: Scene in nerfstudio's format. Its photographs are only read; those for tests are not.
