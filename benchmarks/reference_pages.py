@@ -78,12 +78,17 @@ def options_page() -> str:
     parts = [OPTIONS_HEAD, "## `leco-occupancy`\n"]
     parts += _options(leco_occupancy.config.pipeline, "--pipeline", shown)
     parts += _options(leco_occupancy.config, "--", shown, without={"pipeline"})
-    parts += ["## Guided hosts: `leco-ngp`, `leco-nerfacto`, `leco-switch-nerf`\n"]
+    parts += [
+        "## Guided hosts: `leco-ngp`, `leco-nerfacto`, `leco-switch-nerf`, `leco-mega-nerf`\n"
+    ]
     parts += _options(
         leco_ngp.config.pipeline, "--pipeline", shown, {"datamanager", "host", "learning"}
     )
-    parts += ["## The host of `leco-switch-nerf`, and `switch-nerf`\n"]
-    parts += ["`switch-nerf` has these at `--pipeline.model`.\n"]
+    parts += ["## The host of `leco-switch-nerf` and `leco-mega-nerf`, and `switch-nerf`\n"]
+    parts += [
+        "`switch-nerf` has these at `--pipeline.model`.",
+        "`leco-mega-nerf` has `.balance` `0.0` and `.routing` `nearest`.\n",
+    ]
     parts += _options(leco_switch_nerf.config.pipeline.model.host, "--pipeline.model.host", shown)
     parts += [
         "## Data parsers\n",
@@ -136,7 +141,7 @@ def _options(
             rows.append([f"`{name}`", _value(value), _line(declared[field.name])])
     if rows and kind in shown:
         defaults = ", ".join(f"{name} {value}" for name, value, _ in rows)
-        yield f"### `{flag}`\n\nAs `{shown[kind]}`. Defaults: {defaults}.\n"
+        yield f"### `{flag.removesuffix(' --')}`\n\nAs `{shown[kind]}`. Defaults: {defaults}.\n"
     elif rows:
         shown[kind] = flag
         title = "all of `ns-train`" if flag == "--" else f"`{flag.removesuffix(' --')}`"

@@ -131,7 +131,8 @@ def capacity(
         out: Folder of the picture.
         grids: Cells along an axis of the occupancy grids.
         lost_surface_mass: Share of the weight near surfaces that each may lose.
-        learn_steps: Steps in which the field is learned, at most.
+        learn_steps: Steps in which the field is learned; where its gate has not settled by then, up
+            to half as many more.
         json: Another file for the results.
     """
     from leco_plugin.capacity.measuring import capacity as measure

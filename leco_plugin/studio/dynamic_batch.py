@@ -28,9 +28,9 @@ class ClampedDynamicBatchPipelineConfig(DynamicBatchPipelineConfig):
     _target: type = field(default_factory=lambda: ClampedDynamicBatchPipeline)
     """target class to instantiate"""
     fewest_rays: int = FEWEST_RAYS
-    """Rays of the smallest batch."""
+    """Of leco-ngp: rays of the smallest batch."""
     most_rays: int = MOST_RAYS
-    """Rays of the largest batch."""
+    """Of leco-ngp: rays of the largest batch."""
 
 
 class ClampedDynamicBatchPipeline(DynamicBatchPipeline):
