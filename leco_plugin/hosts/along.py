@@ -74,7 +74,8 @@ def open_occupancy(data: LearningData, config: SharpeningConfig) -> Occupancy:
     region = Region()
     region.set(data.survey.bounds)
     data.note_views(region)
-    report = {"aabb": region.aabb.tolist(), "empty_fraction": 0.0, **data.facts()}
+    report = {"near": float(region.near), "far": float(region.far), "empty_fraction": 0.0}
+    report |= {"aabb": region.aabb.tolist(), **data.facts()}
     report |= dict.fromkeys((*LOSSES, *ERRORS), 0.0)
     precision, walls = fast_precision(region.aabb.device), region.aabb
     made = Occupancy(Gate(config.gate), region.space, OPEN, precision, report, walls, region.seen)
@@ -129,6 +130,7 @@ class Along:
         self.host, self.guide, self.config, self.run = host, guide, config, run
         self.manager = pipeline.datamanager
         self.steps, self.began, self.spent = 0, seconds_now(), 0.0
+        self.march: dict[str, float] = {}
 
     def begin(self) -> None:
         """Guides the host by bounds alone, where it has no occupancy yet; where it has taught one,
@@ -184,7 +186,7 @@ class Along:
         say(f"{what} {found.line_beside(before.report, skipped)}")
         costs = found.on_top_of(before.report)._asdict()
         known = {name: value for name, value in before.report.items() if name not in OF_A_GATE}
-        report = {**known, **costs, "step": step, "learned": "along"}
+        report = {**known, **costs, **self.march, "step": step, "learned": "along"}
         report |= {"params": sum(p.numel() for p in gate.parameters())}
         report |= {"train_seconds": round(self.spent + seconds, 2), "calibration_rays": len(truth)}
         made = before.with_gate(gate, found.threshold, report)
@@ -222,6 +224,8 @@ class Along:
         guide, occupancy, bounds = self.guide, self.guide.the_occupancy(), self._bounds
 
         def hear(rays_o: Tensor, rays_d: Tensor, options: dict[str, Any]) -> Any:
+            step, cone = options.get("render_step_size", 1e-3), options.get("cone_angle", 0.0)
+            self.march = {"step_size": step, "cone_angle": cone}
             limits = {"early_stop_eps": 0.0, "alpha_thre": 0.0}
             samples = bounds.sampling(rays_o, rays_d, **{**options, **limits})
             one = _heard_of(occupancy, samples, rays_o, rays_d, options)

@@ -114,6 +114,8 @@ def test_its_weights_teach_a_gate_that_keeps_the_ball_and_skips_the_air(made: An
     left = Occupancy.load(made.out / "occupancy.safetensors")
     assert left.threshold == occupancy.threshold > OPEN
     assert left.report["learned"] == "along" and left.report["empty_fraction"] > 0.3
+    assert left.report["step_size"] == MARCH["render_step_size"]  # as a loop of one's own asks
+    assert left.report["cone_angle"] == 0.0 < left.report["near"] < left.report["far"]
     on_it = torch.nn.functional.normalize(torch.randn(500, 3), dim=-1) * BALL_RADIUS * 0.97
     on_it = on_it[on_it[:, 2] > 0.0] + torch.tensor(BALL_CENTRE)
     assert float(occupancy.occupied(on_it).float().mean()) > 0.98
