@@ -74,8 +74,8 @@ def open_occupancy(data: LearningData, config: SharpeningConfig) -> Occupancy:
     region = Region()
     region.set(data.survey.bounds)
     data.note_views(region)
-    report = {"near": float(region.near), "far": float(region.far), "empty_fraction": 0.0}
-    report |= {"aabb": region.aabb.tolist(), **data.facts()}
+    report = {"aabb": region.aabb.tolist(), "empty_fraction": 0.0, **data.facts()}
+    report |= {"near": float(region.near), "far": float(region.far)}
     report |= dict.fromkeys((*LOSSES, *ERRORS), 0.0)
     precision, walls = fast_precision(region.aabb.device), region.aabb
     made = Occupancy(Gate(config.gate), region.space, OPEN, precision, report, walls, region.seen)
