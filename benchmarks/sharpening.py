@@ -45,9 +45,9 @@ from leco_plugin.learning.sharpening import (
     Lesson,
     Score,
     SharpeningConfig,
-    asked_by,
-    lesson_by,
-    seen_reference,
+    guided_reference,
+    lesson_from_field,
+    rescore_rendering,
     sharpen,
     teach,
 )
@@ -79,11 +79,11 @@ class Priced:
     def __init__(self, mixture: Mixture, seen: Seen) -> None:
         self.mixture, self.chunks = mixture, in_chunks(seen.rays, 1024)
         given = mixture, seen.rays, on_black(seen.truth), 1024
-        self.rendering = dense_rendering(*given, seen_reference)
+        self.rendering = dense_rendering(*given, guided_reference)
 
     def asked(self, score: Score) -> DenseRendering:
         """With what a gate or a grid says of candidates."""
-        return asked_by(self.mixture, score, self.chunks, self.rendering)
+        return rescore_rendering(self.mixture, score, self.chunks, self.rendering)
 
 
 def taught_by(source: Source, mixture: Mixture) -> dict[str, Any]:
@@ -118,7 +118,7 @@ def taught_by(source: Source, mixture: Mixture) -> dict[str, Any]:
             {"seconds": round(seconds, 1), "held_out": shown(found.measured), "test": shown(after)}
         )
         print(f"  seed {seed}: {rows[-1]}", flush=True)
-        lesson = lesson_by(mixture, taught, losses, 1.0, 1024)
+        lesson = lesson_from_field(mixture, taught, losses, 1.0, 1024)
         of_seed = {}
         for name, (_, score) in grids_of(mixture, lesson).items():
             measured = calibrate(on_held_out.asked(score), calibration, spent=mixture.report)
@@ -169,7 +169,7 @@ def at_equal_loss(source: Source, mixture: Mixture) -> tuple[list[dict[str, Any]
     occupancy = mixture.occupancy().eval()
     losses = model.config.gate_loss
     lessons = [
-        lesson_by(mixture, rays_that_teach(source, occupancy, seed), losses, 0.0, 1024)
+        lesson_from_field(mixture, rays_that_teach(source, occupancy, seed), losses, 0.0, 1024)
         for seed in range(SEEDS)
     ]
     lesson = lessons[0]

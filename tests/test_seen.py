@@ -93,7 +93,7 @@ def test_a_region_notes_rays_between_its_walls() -> None:
     region = Region()
     walls = torch.tensor([-NO_WALL, -NO_WALL, -0.5, NO_WALL, NO_WALL, 0.5])
     region.set(SceneBounds("box", torch.zeros(3), 1.0, 0.1, 5.0, walls, ""))
-    region.see(torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[0.0, 0.0, -1.0]]))
+    region.note_crossed_space(torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[0.0, 0.0, -1.0]]))
     line = torch.tensor([[0.0, 0.0, 0.4], [0.0, 0.0, -0.4], [0.0, 0.0, 0.9], [0.3, 0.0, 0.0]])
     assert region.seen(line).tolist() == [True, True, False, False]
 

@@ -41,7 +41,7 @@ from leco_plugin.evaluation.report import (
     made_by,
     read_object,
 )
-from leco_plugin.learning.sharpening import Lesson, lesson_by, teach
+from leco_plugin.learning.sharpening import Lesson, lesson_from_field, teach
 from leco_plugin.log import bar, put
 from leco_plugin.models.gate import GateConfig, occupancy_logit
 from leco_plugin.models.leco import LecoModel
@@ -137,7 +137,7 @@ def lesson_of(source: Source, losses: GateLossConfig) -> Lesson:
     mixture = source.mixture
     assert mixture is not None
     taught = draw_training_rays(source, mixture.occupancy().eval(), TAUGHT_RAYS).rays
-    return lesson_by(mixture, taught, losses, seen=0.0, rays_at_once=RAYS_AT_ONCE)
+    return lesson_from_field(mixture, taught, losses, share=0.0, rays_at_once=RAYS_AT_ONCE)
 
 
 def measure(evidence: Evidence, scores: Tensor, of_volume: Tensor, lost: float) -> dict[str, Any]:

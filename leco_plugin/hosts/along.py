@@ -34,7 +34,7 @@ from leco_plugin.learning.calibration import (
 from leco_plugin.learning.dense import DenseRendering, Reference, evaluating, near_surface
 from leco_plugin.learning.freezing import leave_file
 from leco_plugin.learning.run import Run
-from leco_plugin.learning.sharpening import SharpeningConfig, lesson_of, teach
+from leco_plugin.learning.sharpening import SharpeningConfig, lesson_from_weights, teach
 from leco_plugin.log import note, say
 from leco_plugin.models.compute.device import fast_precision
 from leco_plugin.models.gate import Gate
@@ -168,7 +168,7 @@ class Along:
             held_out = self._hear([bundle])
             gate = teach(
                 config.sharpening.gate,
-                lesson_of(
+                lesson_from_weights(
                     taught.mapped, taught.weights, taught.intervals.ray_indices, config.gate_loss
                 ),
                 config.sharpening.steps,

@@ -148,7 +148,7 @@ class Guide(nn.Module):
         origins, directions = (part.reshape(-1, 3) for part in covering_rays(cameras, SIDE))
         frame = self.frame.cpu()
         unit = torch.nn.functional.normalize(turned(directions, frame), dim=-1)
-        self._region().look(moved(origins, frame), unit)
+        self._region().note_backdrops(moved(origins, frame), unit)
 
     def _region(self) -> Region:
         """Where the occupancy lies, with the backdrops that were seen there."""

@@ -68,7 +68,7 @@ class Learner:
         progress: how far the run has come; changed in place, and stored in checkpoints.
 
     Attributes:
-        over: whether a first phase that freezes nothing is over.
+        past_learning: whether the first phase is over and no gate is ever frozen.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Learner:
     ) -> None:
         self.mixture, self.data, self.run = mixture, data, run
         self.config, self.progress = config, progress
-        self.history, self.over = GateHistory(), False
+        self.history, self.past_learning = GateHistory(), False
         restarted = config.schedule.restart
         self.held_out = HeldOut(mixture, data, config.calibration, restarted)
         self.watch = PriceWatch(progress.watch, self.held_out, config.calibration, mixture.device)
@@ -134,9 +134,9 @@ class Learner:
         what checkpoints hold: a resumed run is where it was."""
         config, progress, frozen = self.config, self.progress, bool(self.mixture.frozen)
         never_frozen = config.homogeneous or not config.schedule.freeze
-        self.over = never_frozen and step >= progress.learn_steps
+        self.past_learning = never_frozen and step >= progress.learn_steps
         keep_pace(self.run.optimizers(), progress.pace)
-        learning = not (frozen or self.over)
+        learning = not (frozen or self.past_learning)
         self.data.prepare_batch(
             self._guided_batch() if frozen else self._learning_batch(step),
             distances=learning and config.termination > 0.0,
@@ -150,7 +150,7 @@ class Learner:
         The same in every process: the mean of their gradients is then that of one large batch.
         """
         progress = self.progress
-        if self.over or is_dense(progress, step):
+        if self.past_learning or is_dense(progress, step):
             # no longer followed; and what a gate kept that has collapsed says nothing
             progress.learning_kept = 1.0
         progress.learning_kept = mean(progress.learning_kept, self.mixture.device)
@@ -172,7 +172,7 @@ class Learner:
             seconds: that the step took.
             kept: samples a ray that the frozen gate kept of the batch, backdrops excluded.
         """
-        if self.over or self.config.homogeneous:
+        if self.past_learning or self.config.homogeneous:
             return
         if bool(self.mixture.frozen):
             self._watch(step, seconds, kept)

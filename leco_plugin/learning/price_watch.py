@@ -21,9 +21,10 @@ from leco_plugin.models.compute.ranks import from_first, mean
 
 REMEMBERED = 0.8
 """How much the rays of a measurement count beside those of the next: the field goes on learning."""
-SURE = 2.0
-"""Standard errors by which a price must be beyond its bound. Without, a long run of measurements
-would lower the threshold of a sound gate step by step to nothing."""
+SURE_AGAIN = 2.0
+"""Standard errors by which a price must be beyond its bound: twice `calibration.SURE`, because many
+measurements follow one another. With fewer, chance alone would lower a sound gate's threshold step
+by step to nothing."""
 SHARE_OF_TIME = 0.01
 """Of guided training, the largest share that measuring again may take."""
 
@@ -45,12 +46,12 @@ class Evidence(NamedTuple):
         return Evidence(*(share * total for total in sums))
 
     def exceeds(self) -> bool:
-        """Whether the mean is above 0 by more than `SURE` standard errors."""
+        """Whether the mean is above 0 by more than `SURE_AGAIN` standard errors."""
         if self.rays <= 1.0:
             return False
         mean = self.total / self.rays
         variance = max(0.0, self.squares / self.rays - mean * mean)
-        return mean > 0.0 and mean > SURE * math.sqrt(variance / self.rays)
+        return mean > 0.0 and mean > SURE_AGAIN * math.sqrt(variance / self.rays)
 
 
 class PriceSource(Protocol):

@@ -62,9 +62,16 @@ class Lesson(NamedTuple):
     """[M] weight of -log(1 - o(x))."""
 
 
-def lesson_of(mapped: Tensor, weights: Tensor, of_rays: Tensor, losses: GateLossConfig) -> Lesson:
-    """The targets of the contribution loss, by its w_0 and k, at samples along rays: positions
-    [M, 3] in [-1, 1], in the order of rays, then distance; rendering weights [M]; and rays [M]."""
+def lesson_from_weights(
+    mapped: Tensor, weights: Tensor, of_rays: Tensor, losses: GateLossConfig
+) -> Lesson:
+    """The targets of the contribution loss, with its w_0 and k, at samples along rays.
+
+    Args:
+        mapped: [M, 3] in [-1, 1], in the order of rays, then distance.
+        weights: [M] rendering weights.
+        of_rays: [M] int64, the ray of each sample.
+    """
     wide = widen(weights, of_rays[1:] == of_rays[:-1])
     target = (wide / losses.weight_at_full).clamp(max=1.0)
     return Lesson(mapped, losses.emphasis * target, 1.0 - target)
@@ -78,8 +85,7 @@ def teach(
     seed: int = 0,
     on_progress: Callable[[float], None] | None = None,
 ) -> Gate:
-    """A gate that was taught by a lesson, in the precision of its later queries, and rounded as it
-    is stored.
+    """A new gate, taught by a lesson in `precision` and rounded to bfloat16.
 
     Minimises mean[-keep log o - skip log(1 - o)], the contribution loss with given targets.
 
@@ -214,61 +220,65 @@ def sharpen(
     """
     at_once = calibration.rays_at_once
     with evaluating(mixture):
-        lesson = lesson_by(mixture, taught, losses, 1.0, at_once)
+        lesson = lesson_from_field(mixture, taught, losses, 1.0, at_once)
         if not len(lesson.mapped):
             return None
         gate = teach(config.gate, lesson, config.steps, mixture.precision)
         rays, truth = held_out
-        rendering = dense_rendering(mixture, rays, truth, at_once, seen_reference)
+        rendering = dense_rendering(mixture, rays, truth, at_once, guided_reference)
         before = measure(rendering, float(mixture.threshold))
         score = partial(mixture.occupancies, gate=gate)
-        asked = asked_by(mixture, score, in_chunks(rays, at_once), rendering)
-        of_each = [of_one for of_one, _ in cameras]
-        seen = [seen_reference(mixture, of_one) for of_one in of_each]
-        of_cameras = list(map(partial(_said_by, mixture, score), of_each, seen))
+        by_small = rescore_rendering(mixture, score, in_chunks(rays, at_once), rendering)
+        of_cameras = [
+            _rescore(mixture, score, of_one, guided_reference(mixture, of_one))
+            for of_one, _ in cameras
+        ]
         spent = mixture.report
-        measured = calibrate(asked, calibration, cameras=of_cameras, spent=spent)
+        measured = calibrate(by_small, calibration, cameras=of_cameras, spent=spent)
         promised = promise(of_cameras, measured, calibration, spent)
         return Sharpened(gate, measured, before, promised)
 
 
 @torch.no_grad()
-def lesson_by(
-    mixture: Mixture, rays: Rays, losses: GateLossConfig, seen: float, rays_at_once: int
+def lesson_from_field(
+    mixture: Mixture, rays: Rays, losses: GateLossConfig, share: float, rays_at_once: int
 ) -> Lesson:
-    """What a field has to teach along rays, cut to the mixture's region: the targets of the
-    contribution loss at all candidates. Those are rendered whose o(x) is at least the share `seen`
-    of the threshold; 0 renders all."""
+    """The targets of the contribution loss at all candidates of rays, cut to the mixture's region.
+
+    Args:
+        share: candidates with o(x) below this share of the threshold are not rendered,
+            and have weight 0. At 0 all are rendered.
+    """
     lessons = []
     for chunk in in_chunks(rays, rays_at_once):
-        intervals, mapped, occupancies, drawn, some = _asked(mixture, chunk, seen)
+        intervals, mapped, occupancies, drawn, some = _candidates_of(mixture, chunk, share)
         before = ~backdrop_of(intervals, chunk)
         weights = torch.zeros_like(occupancies)
         weights[drawn] = mixture.weigh(chunk, some)
         of_rays = intervals.ray_indices[before]
-        lessons.append(lesson_of(mapped[before], weights[before], of_rays, losses))
+        lessons.append(lesson_from_weights(mapped[before], weights[before], of_rays, losses))
     return Lesson(*(torch.cat(parts) for parts in zip(*lessons)))
 
 
 @torch.no_grad()
-def _asked(
-    mixture: Mixture, rays: Rays, seen: float
+def _candidates_of(
+    mixture: Mixture, rays: Rays, share: float
 ) -> tuple[Intervals, Tensor, Tensor, Tensor, Intervals]:
-    """The candidates of rays, where they lie [M, 3] in [-1, 1], their o(x) [M], which of them are
-    rendered, bool [M], and those alone."""
+    """Candidates and backdrops of rays, where they lie [M, 3] in [-1, 1], their o(x) [M], which of
+    them are rendered, bool [M], and the rendered ones alone."""
     intervals = mixture.with_backdrops(rays, mixture.candidates(rays))
     mapped = mapped_middles(mixture.region.space, rays, intervals)
     occupancies = mixture.occupancies(mapped)
-    drawn = (occupancies >= seen * mixture.threshold) | backdrop_of(intervals, rays)
+    drawn = (occupancies >= share * mixture.threshold) | backdrop_of(intervals, rays)
     some = Intervals(*(part[drawn] for part in intervals))
     return intervals, mapped, occupancies, drawn, some
 
 
 @torch.no_grad()
-def seen_reference(mixture: Mixture, rays: Rays) -> Reference:
+def guided_reference(mixture: Mixture, rays: Rays) -> Reference:
     """As `dense_reference`, where candidates below the threshold are not rendered and have no
     weight. Guided training has not taught the field what is there."""
-    intervals, _, occupancies, drawn, some = _asked(mixture, rays, 1.0)
+    intervals, _, occupancies, drawn, some = _candidates_of(mixture, rays, 1.0)
     small = reference_of(mixture.shade(rays, some), some, rays)
     weights, surface = torch.zeros_like(occupancies), torch.zeros_like(drawn)
     weights[drawn], surface[drawn] = small.weights.float(), small.near_surface
@@ -277,17 +287,17 @@ def seen_reference(mixture: Mixture, rays: Rays) -> Reference:
 
 
 Score = Callable[[Tensor], Tensor]
-"""o(x), or what stands for it: of mapped positions [M, 3], [M]."""
+"""Mapped positions [M, 3] in [-1, 1] to o(x), or another score, [M]."""
 
 
-def asked_by(
+def rescore_rendering(
     mixture: Mixture, score: Score, chunks: list[Rays], rendering: DenseRendering
 ) -> DenseRendering:
-    """The same rendering of rays, with what another gate, or a grid, says of their candidates."""
+    """The same rendering of rays, with the scores of another gate, or of a grid, as its o(x)."""
     pairs = zip(chunks, rendering.references, strict=True)
-    return rendering._replace(references=[_said_by(mixture, score, *pair) for pair in pairs])
+    return rendering._replace(references=[_rescore(mixture, score, *pair) for pair in pairs])
 
 
-def _said_by(mixture: Mixture, score: Score, rays: Rays, reference: Reference) -> Reference:
+def _rescore(mixture: Mixture, score: Score, rays: Rays, reference: Reference) -> Reference:
     mapped = mapped_middles(mixture.region.space, rays, reference.intervals)
     return reference._replace(occupancies=score(mapped))

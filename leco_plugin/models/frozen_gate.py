@@ -65,13 +65,13 @@ def occupancy_of(gate: Gate, mapped: Tensor, dtype: torch.dtype) -> Tensor:
     if filling:
         mapped = torch.nn.functional.pad(mapped.T, (0, filling)).T
     with torch.no_grad(), torch.autocast("cpu", enabled=False):
-        frozen = frozen_gate(gate, dtype)
+        folded = folded_gate(gate, dtype)
         encoding = gate.encoding
         is_known = isinstance(encoding, FrequencyEncoding)
         features = encoding(mapped, dtype) if is_known else encoding(mapped).to(dtype)
-        for weight, bias in frozen.layers:
+        for weight, bias in folded.layers:
             features = _layer(features, weight, bias)
-        return _occupancy(_logits(frozen, features, gate))[:count]
+        return _occupancy(_logits(folded, features, gate))[:count]
 
 
 def _layer(features: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
@@ -81,26 +81,26 @@ def _layer(features: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     return one_pass(features, weight, bias)
 
 
-def _logits(frozen: FoldedGate, features: Tensor, gate: Gate) -> Tensor:
+def _logits(folded: FoldedGate, features: Tensor, gate: Gate) -> Tensor:
     """How far scene experts lie above emptiness: features [N, width] to float32 [n, N]."""
     count, width = features.shape
-    sums = features.new_empty(len(frozen.head), count, dtype=torch.float32)
+    sums = features.new_empty(len(folded.head), count, dtype=torch.float32)
     lengths = sums.new_empty(count)
     rows_at_once = max(1, UNITS_AT_ONCE * torch.get_num_threads() // width)
     for first in range(0, count, rows_at_once):
         part = slice(first, first + rows_at_once)
         some = features[part].float()
         if gate.config.normed:
-            torch.mm(frozen.head, some.T, out=sums[:, part])
+            torch.mm(folded.head, some.T, out=sums[:, part])
             torch.linalg.vector_norm(some, dim=1, out=lengths[part])
         else:
-            torch.addmm(frozen.shift, frozen.head, some.T, out=sums[:, part])
+            torch.addmm(folded.shift, folded.head, some.T, out=sums[:, part])
     if not gate.config.normed:
         return sums
     above, mean = sums[:-1], sums[-1]
     square = lengths.square_().addcmul_(mean, mean, value=-1.0)
     square.clamp_(min=0.0).add_(width * gate.norm.eps)
-    return torch.addcmul(frozen.shift, above, square.rsqrt_())
+    return torch.addcmul(folded.shift, above, square.rsqrt_())
 
 
 def _occupancy(logits: Tensor) -> Tensor:
@@ -111,12 +111,12 @@ def _occupancy(logits: Tensor) -> Tensor:
     return odds / (odds + 1.0)
 
 
-_found: WeakKeyDictionary[Gate, dict[torch.dtype, FoldedGate]] = WeakKeyDictionary()
+_folded: WeakKeyDictionary[Gate, dict[torch.dtype, FoldedGate]] = WeakKeyDictionary()
 
 
-def frozen_gate(gate: Gate, dtype: torch.dtype) -> FoldedGate:
+def folded_gate(gate: Gate, dtype: torch.dtype) -> FoldedGate:
     """The weights of a gate as they are now, made anew only where one has changed."""
-    found = _found.setdefault(gate, {})
+    found = _folded.setdefault(gate, {})
     if dtype not in found or not found[dtype].snapshot.matches(gate):
         hidden = [cast(nn.Linear, layer) for layer in gate.hidden]
         layers = [(layer.weight.to(dtype), layer.bias.to(dtype)) for layer in hidden]

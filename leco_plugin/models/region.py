@@ -85,13 +85,13 @@ class Region(nn.Module):
             )
 
     @torch.no_grad()
-    def look(self, origins: Tensor, directions: Tensor) -> None:
+    def note_backdrops(self, origins: Tensor, directions: Tensor) -> None:
         """Notes where rays [N, 3] that cover the training images leave the scene."""
         cut = self.cut(origins.to(self.aabb), directions.to(self.aabb))
         self.backdrops.note(cut, ~self.leaves_by_floor(cut))
 
     @torch.no_grad()
-    def see(self, origins: Tensor, directions: Tensor) -> None:
+    def note_crossed_space(self, origins: Tensor, directions: Tensor) -> None:
         """Notes the space that rays [N, 3] cross, which cover all training images."""
         cut = self.cut(origins.to(self.aabb), directions.to(self.aabb))
         self.seen.note(self.space, marching.Rays(*cut[:4]))

@@ -120,7 +120,7 @@ class SwitchNerfModel(Model):
         else:
             data = LearningData(training_callback_attributes.pipeline.datamanager, *asked)
             self.set_bounds(data.survey.bounds, data.survey.median_length)
-            self.region.look(*data.covering_rays())
+            self.region.note_backdrops(*data.covering_rays())
             announce(data.survey)
         before = callbacks.TrainingCallbackLocation.BEFORE_TRAIN_ITERATION
         return [callbacks.TrainingCallback([before], self.update_estimator)]

@@ -62,9 +62,9 @@ class LearningData:
 
     def note_views(self, region: Region) -> None:
         """Tells a region what the training images see of it."""
-        region.look(*self.covering_rays())
-        cameras = len(self.manager.train_dataset.cameras)
-        region.see(*self.covering_rays(rays_a_side(cameras), cameras))  # of each image some
+        region.note_backdrops(*self.covering_rays())
+        cameras = len(self.manager.train_dataset.cameras)  # some rays of each image
+        region.note_crossed_space(*self.covering_rays(rays_a_side(cameras), cameras))
 
     def prepare_batch(self, factor: float, distances: bool, set_aside: int = 0) -> None:
         """Sets the next batch, if it is drawn here: `factor` times the config's rays, pixels of

@@ -82,7 +82,7 @@ def test_a_gate_that_is_never_frozen_is_not_followed_once_it_has_learned(made: A
     assert made.sampler.num_rays_per_batch > 300
     plan = made.learner.before_step(7)
     assert made.sampler.num_rays_per_batch == 100
-    assert made.learner.over and plan.following is None
+    assert made.learner.past_learning and plan.following is None
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 import torch
 from ball_occupancy import ENCODINGS
 
-from leco_plugin.learning.sharpening import Lesson, lesson_of, round_weights, teach
+from leco_plugin.learning.sharpening import Lesson, lesson_from_weights, round_weights, teach
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig, occupancy_logit
 from leco_plugin.models.losses import contribution_loss
@@ -71,7 +71,7 @@ def test_the_targets_of_a_lesson_are_those_of_the_contribution_loss() -> None:
     weights = torch.tensor([0.0, 0.04, 0.01, 0.0, 0.3, 0.1])
     of_rays = torch.tensor([0, 0, 0, 1, 1, 1])
     wide = torch.tensor([0.04, 0.04, 0.04, 0.3, 0.3, 0.3])
-    lesson = lesson_of(torch.zeros(6, 3), weights, of_rays, losses)
+    lesson = lesson_from_weights(torch.zeros(6, 3), weights, of_rays, losses)
     target = torch.tensor([0.2, 0.2, 0.2, 1.0, 1.0, 1.0])
     torch.testing.assert_close(lesson.keep, 6.0 * target)
     torch.testing.assert_close(lesson.skip, 1.0 - target)

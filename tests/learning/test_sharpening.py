@@ -20,8 +20,8 @@ from leco_plugin.learning.sharpening import (
     Lesson,
     Sharpened,
     SharpeningConfig,
-    lesson_by,
-    seen_reference,
+    guided_reference,
+    lesson_from_field,
     sharpen,
 )
 from leco_plugin.models.encodings import EncodingConfig
@@ -92,7 +92,7 @@ def some_rays(mixture: Mixture, count: int) -> Rays:
 
 def test_the_lesson_is_the_widened_weight_of_every_candidate() -> None:
     mixture = a_mixture()
-    lesson = lesson_by(mixture, some_rays(mixture, 20), LOSSES, 0.125, 8)
+    lesson = lesson_from_field(mixture, some_rays(mixture, 20), LOSSES, 0.125, 8)
     x = lesson.mapped[:, 0]
     front = -WALL + torch.tensor([-0.04, 0.05])  # a step before the wall, and the first within
     met = (x > front[0]) & (x < front[1])
@@ -105,9 +105,9 @@ def test_the_lesson_is_the_widened_weight_of_every_candidate() -> None:
 def test_only_what_is_seen_is_rendered_and_the_lesson_is_the_same() -> None:
     mixture = a_mixture()
     rays = some_rays(mixture, 20)
-    every = lesson_by(mixture, rays, LOSSES, 0.0, 8)
+    every = lesson_from_field(mixture, rays, LOSSES, 0.0, 8)
     asked = mixture.field.asked
-    some = lesson_by(mixture, rays, LOSSES, 0.125, 8)
+    some = lesson_from_field(mixture, rays, LOSSES, 0.125, 8)
     assert mixture.field.asked - asked < 0.6 * asked
     for one, other in zip(every, some):
         torch.testing.assert_close(one, other)
@@ -118,7 +118,7 @@ def test_what_is_not_seen_has_no_weight_and_is_a_candidate_still() -> None:
     mixture.gate.walls = 0.5  # type: ignore[assignment]
     rays, truth = some_rays(mixture, 10), torch.ones(10, 3)
     dense = dense_rendering(mixture, rays, truth, 10).references[0]
-    seen = seen_reference(mixture, rays)
+    seen = guided_reference(mixture, rays)
     assert len(seen.weights) == len(dense.weights)
     below = seen.occupancies < 0.5
     assert not seen.weights[below & ~seen.always_kept].any() and dense.weights[below].any()
@@ -151,13 +151,13 @@ def test_a_small_gate_may_cost_only_what_the_large_one_has_left() -> None:
 
 def test_only_what_is_kept_is_taught_and_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
     shares: list[float] = []
-    real = sharpening._asked
+    real = sharpening._candidates_of
 
     def noted(mixture: Mixture, rays: Rays, seen: float) -> Any:
         shares.append(seen)
         return real(mixture, rays, seen)
 
-    monkeypatch.setattr(sharpening, "_asked", noted)
+    monkeypatch.setattr(sharpening, "_candidates_of", noted)
     mixture = a_mixture()
     data = some_rays(mixture, 30), (some_rays(mixture, 10), torch.ones(10, 3))
     config = SharpeningConfig(steps=1, gate=GATE)
@@ -255,7 +255,7 @@ def test_at_the_last_step_a_gate_stays(why: str, monkeypatch: pytest.MonkeyPatch
         options["gate"] = GateConfig(table, 8, 1, 1)
     elif why == "no positions":
         empty = Lesson(torch.empty(0, 3), torch.empty(0), torch.empty(0))
-        monkeypatch.setattr(sharpening, "lesson_by", lambda *_: empty)
+        monkeypatch.setattr(sharpening, "lesson_from_field", lambda *_: empty)
     else:
         options["least_steps"] = 20
     mixture = a_mixture()

@@ -115,7 +115,7 @@ def looking(down: float, count: int = 9) -> Cameras:
 def see(region: Region, cameras: Cameras) -> None:
     """Has cameras be those of the training images."""
     origins, directions = covering_rays(cameras, SIDE)
-    region.look(origins.reshape(-1, 3), directions.reshape(-1, 3))
+    region.note_backdrops(origins.reshape(-1, 3), directions.reshape(-1, 3))
 
 
 def shows_a_backdrop(region: Region, cameras: Cameras) -> torch.Tensor:

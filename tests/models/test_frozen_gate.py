@@ -128,6 +128,6 @@ def test_weights_that_change_are_noticed() -> None:
 
 def test_an_unchanged_gate_is_prepared_once_for_each_precision() -> None:
     gate = gate_of()
-    first = frozen_gate.frozen_gate(gate, torch.float32)
-    assert frozen_gate.frozen_gate(gate, torch.bfloat16).layers[0][0].dtype == torch.bfloat16
-    assert frozen_gate.frozen_gate(gate, torch.float32) is first
+    first = frozen_gate.folded_gate(gate, torch.float32)
+    assert frozen_gate.folded_gate(gate, torch.bfloat16).layers[0][0].dtype == torch.bfloat16
+    assert frozen_gate.folded_gate(gate, torch.float32) is first
