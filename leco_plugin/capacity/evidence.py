@@ -17,7 +17,7 @@ from torch import Tensor
 from leco_plugin.capacity.sources import Seen
 from leco_plugin.evaluation.field_grids import in_parts
 from leco_plugin.learning.calibration import EXACT, price_db
-from leco_plugin.learning.dense import in_chunks, near_surface, weighed
+from leco_plugin.learning.dense import in_chunks, near_surface, weights_by_ray
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.rendering import Intervals, Rays, backdrop_of
 from leco_plugin.occupancy import Occupancy
@@ -120,7 +120,7 @@ def _by_rendering(
     weights = torch.zeros_like(intervals.t_starts)
     weights[drawn] = shaded.weights.float()
     surface = torch.zeros_like(kept)
-    surface[drawn] = near_surface(*weighed(shaded), guided, is_backdrop[drawn])
+    surface[drawn] = near_surface(*weights_by_ray(shaded), guided, is_backdrop[drawn])
     per_candidate = (positions, intervals.ray_indices, kept, weights, weights * surface)
     evidence = Evidence._make([*(x[~is_backdrop] for x in per_candidate), len(rays.origins)])
     return evidence, Rendered(rays, guided, ~is_backdrop[drawn], shaded.rgb, truth)

@@ -28,8 +28,8 @@ SURE = 1.0
 MOST = 10.0
 """Times its bound that a price may be measured, however large its standard error is."""
 MORE_KEPT = 1.25
-"""Times as many candidates that photographs which vouch may have kept at most. To a view that no
-other photograph resembles no threshold does justice: how much it loses is said."""
+"""Photographs that vouch may lower the threshold until so many times as many candidates are kept,
+and no further. A view that resembles no other loses much by any threshold: the report says so."""
 EXACT = 1e-10
 """Mean squared error, 100 dB, below which two renderings are both exact."""
 
@@ -76,14 +76,17 @@ class CalibrationConfig:
 
 
 class Measured(NamedTuple):
-    """What a threshold does, on one set of rays."""
+    """What a threshold costs and saves, on one set of rays."""
 
     threshold: float
     lost_surface_mass: float
+    """Share of the weight near surfaces that is skipped."""
     lost_mass: float
+    """Share of all weight that is skipped."""
     image_price_db: float
+    """PSNR lost by skipping; NaN where nothing was rendered."""
     empty_fraction: float
-    """Share of all candidates between near and far that are skipped."""
+    """Share of all candidates that are skipped."""
     surface_error: float = 0.0
     """Standard error of `lost_surface_mass`, by the spread over rays."""
     price_error_db: float = 0.0
@@ -98,8 +101,7 @@ class Measured(NamedTuple):
         )
 
     def on_top_of(self, before: Mapping[str, Any]) -> Measured:
-        """The same with the costs of both, and their standard errors, where a report says what
-        skipping has cost before."""
+        """The same with the costs and standard errors of an earlier report added to its own."""
         known = {name: float(before.get(name) or 0.0) for name in (*LOSSES, *ERRORS)}
         # in this order NaN stays NaN
         costs = {name: max(getattr(self, name), 0.0) + max(known[name], 0.0) for name in LOSSES}
@@ -111,10 +113,10 @@ class Measured(NamedTuple):
         return f"{self.on_top_of(before).line} in all, where {skipped:.1%} were skipped"
 
     def within(self, config: CalibrationConfig) -> bool:
-        """Whether neither price is found to be beyond its bound, by `SURE` standard errors, nor
-        beyond `MOST` times the bound at all.
+        """Whether each price is at most its bound and `SURE` standard errors, and at most `MOST`
+        times its bound.
 
-        In a small scene one ray at the rim of a thing is worth more than the bound.
+        In a small scene a single ray at the rim of a thing costs more than the bound.
         """
         return all(
             price - min(SURE * error, (MOST - 1.0) * bound) <= bound
@@ -176,9 +178,9 @@ def promise(
 
 
 def promise_below(report: Mapping[str, Any], threshold: float) -> dict[str, Any]:
-    """What a report says of photographs that vouch once its threshold has been lowered. They lose
-    no more by less, so that what they were asked at freezing still holds; by nothing, nothing. Of
-    a field that they have trained since, they could not vouch."""
+    """What changes in a report's promise when its threshold is lowered: at 0 nothing is lost. Above
+    0 no more is lost, so the promise made at freezing holds. It cannot be measured again: those
+    photographs have trained the field since."""
     said = report.get(CAMERAS_THAT_VOUCH)
     if not said or threshold > 0.0:
         return {}
@@ -257,11 +259,10 @@ def measure(
 
     Args:
         with_image: whether to render at all; the image price is NaN otherwise.
-        missed_only: count as lost only what lies on rays whose pixel is better rendered with what
-            is lost near surfaces; with an image. Guided training never corrects the field where the
-            gate skips, so haze may stand there. Only the photographs can tell it from a surface
-            that is missing. A loss that the field has since painted over no longer shows in the
-            error: it is found soon after freezing or not at all.
+        missed_only: of a ray, count lost surfaces only if its pixel is better rendered with them;
+            needs `with_image`. Guided training never corrects the field where the gate skips, so
+            haze may stand there, and only photographs tell it from a surface. A loss that the field
+            has since painted over no longer shows: it is found soon after freezing or not at all.
     """
     rays = ray_prices(rendering, threshold, with_image, missed_only)
     surface = max(float(rays.surface.sum()), 1e-12)
@@ -325,14 +326,15 @@ def calibrate(
 ) -> Measured:
     """The largest threshold of `THRESHOLDS` within the bounds, with what it costs.
 
-    Arguments as for `measure`; only thresholds below `below` are tried. When none is within the
-    bounds, the threshold is 0: everything is kept, which is slow and never wrong.
+    When none is, the threshold is 0: everything is kept, which is slow and never wrong.
 
     Args:
-        cameras: dense renderings of photographs that vouch. By the threshold none of them loses
-            too much, see `worst_loss`, where that keeps no more than `MORE_KEPT` times as much.
-        spent: the report of what has skipped so far, if prices are of skipping more than that. Both
-            together are held to the bounds.
+        below: only lower thresholds are tried.
+        missed_only: as for `measure`.
+        cameras: dense renderings of photographs that vouch. None of them may lose more than
+            `camera_surface_mass`, see `worst_loss`, as far as `MORE_KEPT` allows.
+        spent: the report of what has skipped so far. Its costs are added to those measured, and
+            both together are held to the bounds.
     """
     best, earlier = None, _worst_so_far(spent)
     if earlier > config.camera_surface_mass:

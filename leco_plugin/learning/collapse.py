@@ -86,8 +86,9 @@ def find_collapse(kept_fraction: float, shares: Tensor, has_learned: bool) -> Co
 
 
 def look(progress: Progress, step: int, kept: float, shares: Tensor, last: bool) -> Collapse | None:
-    """The collapse of a gate, if it has lasted, or if this look is the last of the first phase;
-    `progress` notes since when one is suspected. Kept and shares are as for `find_collapse`."""
+    """The collapse of a gate that has lasted for `SUSPECTED_STEPS`, or is there at the last look of
+    the first phase. Notes in `progress` since when one is suspected; kept and shares are as for
+    `find_collapse`."""
     progress.fewest_kept = min(progress.fewest_kept, kept)
     if step + 1 - progress.began < FEWEST_STEPS:
         return None
@@ -218,8 +219,8 @@ def is_dense(progress: Progress, step: int) -> bool:
 def annealed(config: GateLossConfig, progress: Progress, step: int) -> GateLossConfig:
     """The gate's loss settings at a step, after the recoveries so far.
 
-    While samples are dense all weights ramp up from zero again. The pull towards empty space is
-    lambda_g in the paper's form, and 1 / k in logit form.
+    While samples are dense, the weights of all losses but the balance ramp up from zero again. The
+    pull towards empty space is lambda_g in the paper's form, and 1 / k in logit form.
     """
     weight, form = 1.0, form_of(config, progress)
     pull = progress.pull if form == config.form else 1.0
@@ -242,9 +243,10 @@ class StepPlan(NamedTuple):
 
     step: int
     coarse: bool
-    """Whether rays are marched in the coarse steps of the first phase."""
+    """Whether the march is coarse and the field has all losses: in the first phase, and in any case
+    until `ramped` is 1."""
     ramped: float
-    """How far the distortion loss has come in, in [0, 1]."""
+    """See `schedule.ramp`."""
     following: Following | None
     """Which candidates the gate being learned leaves out; None leaves out none."""
     gate_loss: GateLossConfig | None

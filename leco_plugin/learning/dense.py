@@ -49,19 +49,19 @@ class Reference(NamedTuple):
 
 
 def reference_of(shaded: Shaded, intervals: Intervals, rays: Rays) -> Reference:
-    """The reference that a rendering of all candidates of some rays is."""
+    """The reference made of a rendering of all candidates of rays."""
     is_backdrop = backdrop_of(intervals, rays)
     return Reference(
         intervals,
         shaded.weights,
         occupancy_from_logits(shaded.logits),
-        near_surface(*weighed(shaded), intervals, is_backdrop),
+        near_surface(*weights_by_ray(shaded), intervals, is_backdrop),
         shaded.rgb,
         is_backdrop,
     )
 
 
-def weighed(shaded: Shaded) -> tuple[Tensor, Tensor, Tensor]:
+def weights_by_ray(shaded: Shaded) -> tuple[Tensor, Tensor, Tensor]:
     """Rendering weights [M], their sums [R], and start and count of each ray [R, 2]."""
     return shaded.weights, shaded.accumulation, shaded.packed_info
 
@@ -75,12 +75,12 @@ def near_surface(
 ) -> Tensor:
     """Which samples lie within `SURFACE_STEPS` steps of their ray's surface: [M] bool.
 
-    A ray whose median depth lies in the backdrop meets none, unless hardly any ray of them all
-    meets one. What is thin and before the sky has less than half of its ray's weight: it is guarded
-    by the image price alone.
+    A ray whose median depth lies in the backdrop has no surface, unless fewer than
+    `FEWEST_SURFACES` of the rays have one. Thin things before the sky have less than half of their
+    ray's weight: the image price alone guards them.
 
     Args:
-        weights, accumulation, packed_info: see `weighed`.
+        weights, accumulation, packed_info: see `weights_by_ray`.
         is_backdrop: [M] bool.
     """
     if len(is_backdrop) == 0:
@@ -95,7 +95,7 @@ def near_surface(
 def near_median_depth(shaded: Shaded, intervals: Intervals) -> Tensor:
     """Which samples lie within `SURFACE_STEPS` steps of the depth that halves their ray's weight:
     [M] bool."""
-    return _near(_medians(*weighed(shaded), intervals), intervals)
+    return _near(_medians(*weights_by_ray(shaded), intervals), intervals)
 
 
 def _near(medians: Tensor, intervals: Intervals) -> Tensor:
@@ -121,13 +121,13 @@ def _medians(
 
 
 class DenseRendering(NamedTuple):
-    """Rays with which skipping is compared, in chunks."""
+    """Held-out rays in chunks, rendered densely, and a way to render them with less."""
 
     references: list[Reference]
     truths: list[Tensor]
     """True pixels, [R, 3] each."""
     render_kept: Callable[[int, Tensor], Tensor]
-    """Renders a chunk, by its number, with only the samples of a mask [M]: returns [R, 3]."""
+    """The colours [R, 3] of a chunk, by its number, from the samples of a bool mask [M] alone."""
 
 
 @contextmanager

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 OF_SURFACES = ("lost_surface_mass", "lost_mass", "surface_error")
-"""What a report says of lost weight, which haze makes up for."""
+"""What a report says of lost weight: the haze of a restarted field falsifies it."""
 
 
 class HeldOut(PriceSource):
@@ -44,10 +44,9 @@ class HeldOut(PriceSource):
 
     Args:
         config: how many, and what skipping may cost.
-        restarted: whether the field was begun anew when the gate was frozen. It has put surfaces
-            before the haze of its first weights where the gate skips: none of its surfaces is
-            asked for. That haze also makes any skipping look good, so that such a field is in
-            effect not watched.
+        restarted: whether the field was started anew when the gate was frozen. Where the gate
+            skips, it keeps the haze of its first weights, which would count as lost surface: only
+            the image price has a bound. Haze flatters that too: in effect nothing is watched.
     """
 
     def __init__(
@@ -95,8 +94,8 @@ class HeldOut(PriceSource):
 
     @torch.no_grad()
     def lower(self, below: float, seed: int) -> Measured:
-        """The largest threshold below another one that is within the bounds for the field now. Of a
-        field that was begun anew it declares the surfaces that the first one lost by more."""
+        """The largest threshold below another one within the bounds, for the field as it is now.
+        For a restarted field the report keeps the lost mass of the first field."""
         config = self.guided
         rays, truth = self.rays(config.rays, seed, "all")
         with evaluating(self.mixture):
@@ -108,8 +107,7 @@ class HeldOut(PriceSource):
         return found._replace(**{name: report[name] for name in OF_SURFACES if name in report})
 
     def excesses(self, seed: int) -> dict[str, Tensor]:
-        """What is lost near surfaces counts where the photographs miss it: where the gate skips,
-        the field is not trained any more, and shows haze."""
+        """See `PriceSource`; lost surfaces count as with `missed_only` of `calibration.measure`."""
         config, mixture = self.guided, self.mixture
         rays, truth = self.rays(config.recheck_rays, seed, "recheck")
         with evaluating(mixture):

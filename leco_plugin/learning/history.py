@@ -14,7 +14,7 @@ from torch import Tensor
 from leco_plugin.log import say
 from leco_plugin.models.compute.ranks import share
 from leco_plugin.models.gate import Gate, GateConfig, check_sizes
-from leco_plugin.models.losses import expert_shares
+from leco_plugin.models.losses import expert_statistics
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.rendering import gate_values_and_routes
 from leco_plugin.occupancy import Occupancy, gate_precision
@@ -57,16 +57,17 @@ class Probes:
     def routes_and_densities(self) -> tuple[Tensor, Tensor]:
         """The expert of each position [P] int64, and densities there [P] per half extent."""
         mixture, places = self.mixture, self.positions
-        left = mixture.field.experts.remaining_experts()
+        remaining = mixture.field.experts.remaining_experts()
         with gate_precision(mixture.device.type, mixture.precision):
-            values, routes = gate_values_and_routes(mixture.gate(places), mixture.routing, left)
+            logits = mixture.gate(places)
+            values, routes = gate_values_and_routes(logits, mixture.routing, remaining)
             return routes, mixture.field.density(places, routes, values)[0]
 
 
 def as_learned(occupancy: Occupancy) -> Occupancy:
-    """An occupancy with a gate and threshold as they were learned, before a smaller one was taught;
-    the weights of such a gate are those of a new one: a history holds the real ones. ValueError if
-    the report is damaged."""
+    """An occupancy with a gate of the learned shape, and the learned threshold, where a small gate
+    has taken over. Its weights are new: a history holds the learned ones. ValueError if the report
+    is damaged."""
     learned = occupancy.report.get("learned")
     if learned is None or learned == "along":  # by a host, with no larger gate before
         return occupancy
@@ -98,13 +99,11 @@ class GateHistory:
 
     def look(self, step: int, seconds: float, gate: Gate, routes: Tensor, sigmas: Tensor) -> None:
         """Remembers the gate after a step; routes and sigmas as of `routes_and_densities`."""
-        experts = 1 + gate.config.scene_experts
-        shares = expert_shares(routes, experts)
-        sums = torch.zeros_like(shares).index_add_(0, routes, sigmas.float())
+        shares, densities = expert_statistics(routes, sigmas, 1 + gate.config.scene_experts)
         self.steps.append(step)
         self.seconds.append(seconds)
         self.shares.append(shares.cpu())
-        self.densities.append((sums / (shares * len(routes)).clamp(min=1.0)).cpu())
+        self.densities.append(densities.cpu())
         state = gate.state_dict()
         self.weights.append({name: value.detach().cpu().clone() for name, value in state.items()})
 

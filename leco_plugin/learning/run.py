@@ -112,23 +112,25 @@ class Progress:
     """Travels with a checkpoint, as plain values and one tensor."""
 
     learn_steps: int = 0
-    """Step of the run at which the first phase ends, later after recoveries and extensions."""
+    """Step of the run at which the first phase ends: not a count. Recoveries and extensions move
+    it."""
     configured: int = 0
-    """`ScheduleConfig.learn_steps` that they were made from; 0 before the first step."""
+    """`ScheduleConfig.learn_steps` when `phase` was set; 0 before the first step."""
     phase: int = 0
-    """Those of the config as far as this run has room for them; 0 before the first step."""
+    """Length of the first phase in steps: `configured`, or what the run has room for; 0 before the
+    first step."""
     began: int = 0
-    """Step at which what is learned now began: after 0 where gate and field have begun anew."""
+    """Step at which gate and field last began to learn; 0 unless both were started anew."""
     learn_seconds: float = 0.0
     """Time spent in the first phase."""
     extensions: int = 0
-    """How often a gate that had not settled has been given more steps."""
+    """How often the first phase was extended, because the gate had not settled."""
     recoveries: int = 0
     """How often a collapsed gate has been healed."""
     suspected_since: int = -1
     """Step since which the gate looks collapsed; -1 where it does not."""
     fewest_kept: float = 1.0
-    """Smallest share of the probe positions that the gate has kept at any look since it began."""
+    """Smallest share of the probe positions kept at any look, since the gate began or was reset."""
     healed_at: int = -1
     """Step of the last recovery that began on dense samples; -1 is none."""
     dense_until: int = 0
@@ -156,7 +158,8 @@ class Progress:
 
     @property
     def since(self) -> int:
-        """Step from which the first phase is counted: its beginning, or the last recovery's."""
+        """Step from which `phase` counts: where learning began, or after the last recovery on dense
+        samples."""
         return max(self.began, self.healed_at + 1)
 
     @property
@@ -165,7 +168,7 @@ class Progress:
         return self.suspected_since >= 0 or self.watch.nothing_since >= 0
 
     def has_shaded(self, share: float) -> None:
-        """Takes in which share of a batch's candidates was shaded while the gate is learned."""
+        """Updates `learning_kept` by the share of a batch's candidates that was shaded."""
         self.learning_kept = 0.9 * self.learning_kept + 0.1 * share
 
     def begin(self, configured: int, most: int) -> None:

@@ -1,4 +1,4 @@
-"""The two phases of a run: the schedules during learning, and the test for its end."""
+"""When the first phase of a run ends, and how far its late losses have come in by then."""
 
 from __future__ import annotations
 
@@ -61,11 +61,11 @@ class ScheduleConfig:
 
 
 def ramp(step: int, config: ScheduleConfig) -> float:
-    """How far the distortion loss has come in at a step since `Progress.began`: 0 at first, 1 from
-    `ramp_to` on.
+    """How far the distortion loss has come in, and what comes in with it, at a step since
+    `Progress.began`: in [0, 1].
 
-    At once it would press all weight onto the ends of the rays, which is a flat picture behind the
-    scene; first the views have to find the surfaces between them.
+    From the first step on it would press all weight onto the ends of the rays: a flat picture
+    behind the scene. First the views have to find the surfaces.
     """
     start, end = (share * config.learn_steps for share in (config.ramp_from, config.ramp_to))
     return min(1.0, max(0.0, (step - start) / max(1.0, end - start)))
@@ -83,12 +83,12 @@ def converged(step: int, agreement: float, config: ScheduleConfig) -> bool:
 
 
 def steps_of_an_extension(learn_steps: int) -> int:
-    """Steps that a gate gets beyond those of its config, each time that it has not settled."""
+    """Steps of an extension, for a gate that has not settled after so many steps of learning."""
     return max(1, learn_steps // 4)
 
 
 def schedule_since(schedule: ScheduleConfig, progress: Progress) -> ScheduleConfig:
-    """The schedule of what has begun at `progress.began`."""
+    """The schedule with `learn_steps` counted from `progress.began`, extensions included."""
     return replace(schedule, learn_steps=progress.learn_steps - progress.began)
 
 

@@ -1,10 +1,9 @@
 """Sharpening: a small gate that the field teaches anew, and that skips more than the learned one.
 
-While a gate is learned, haze teaches it too, and it also has to route points to experts. Later in a
-run the field knows better: its rendering weights along training rays teach a fresh gate of seven
-thousand values, which only has to say what is empty. It is calibrated like the first one, and
-skips in its place where it skips more. The large gate goes on routing. A `Lesson` says where a
-gate should keep and skip; a gate alone is taught by it, in seconds.
+While a gate is learned, haze teaches it too, and it also routes points to experts. Late in a run
+the field's rendering weights along training rays, a `Lesson`, teach a fresh gate of seven thousand
+values, which only says what is empty. It is calibrated like the first one, and skips in its place
+if it skips more. The large gate goes on routing.
 """
 
 from __future__ import annotations
@@ -65,13 +64,8 @@ class Lesson(NamedTuple):
 def lesson_from_weights(
     mapped: Tensor, weights: Tensor, of_rays: Tensor, losses: GateLossConfig
 ) -> Lesson:
-    """The targets of the contribution loss, with its w_0 and k, at samples along rays.
-
-    Args:
-        mapped: [M, 3] in [-1, 1], in the order of rays, then distance.
-        weights: [M] rendering weights.
-        of_rays: [M] int64, the ray of each sample.
-    """
+    """The targets of the contribution loss, with its w_0 and k, at samples along rays: positions
+    [M, 3] in [-1, 1], in the order of rays, then distance; rendering weights [M]; and rays [M]."""
     wide = widen(weights, of_rays[1:] == of_rays[:-1])
     target = (wide / losses.weight_at_full).clamp(max=1.0)
     return Lesson(mapped, losses.emphasis * target, 1.0 - target)
@@ -224,11 +218,10 @@ def sharpen(
         if not len(lesson.mapped):
             return None
         gate = teach(config.gate, lesson, config.steps, mixture.precision)
-        rays, truth = held_out
-        rendering = dense_rendering(mixture, rays, truth, at_once, guided_reference)
+        rendering = dense_rendering(mixture, *held_out, at_once, guided_reference)
         before = measure(rendering, float(mixture.threshold))
         score = partial(mixture.occupancies, gate=gate)
-        by_small = rescore_rendering(mixture, score, in_chunks(rays, at_once), rendering)
+        by_small = rescore_rendering(mixture, score, in_chunks(held_out[0], at_once), rendering)
         of_cameras = [
             _rescore(mixture, score, of_one, guided_reference(mixture, of_one))
             for of_one, _ in cameras
@@ -244,11 +237,7 @@ def lesson_from_field(
     mixture: Mixture, rays: Rays, losses: GateLossConfig, share: float, rays_at_once: int
 ) -> Lesson:
     """The targets of the contribution loss at all candidates of rays, cut to the mixture's region.
-
-    Args:
-        share: candidates with o(x) below this share of the threshold are not rendered,
-            and have weight 0. At 0 all are rendered.
-    """
+    Candidates with o(x) below this share of the threshold are not rendered, and have weight 0."""
     lessons = []
     for chunk in in_chunks(rays, rays_at_once):
         intervals, mapped, occupancies, drawn, some = _candidates_of(mixture, chunk, share)

@@ -264,7 +264,7 @@ class HMoEField(nn.Module):
         return plain and widest <= native.WIDEST
 
     def native_parts(self) -> list[Tensor | None]:
-        """Weights and biases as `networks.c` takes them; None for those of an expert that left."""
+        """Weights and biases as `networks.c` takes them; None for those of a dropped expert."""
         layers = self.config.experts.layers
         parts: list[Tensor | None] = [
             *self.projection.parameters(),

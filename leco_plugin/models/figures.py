@@ -11,7 +11,7 @@ from torch import Tensor
 
 from leco_plugin.evaluation.metrics import image_metrics
 from leco_plugin.models.gate import EMPTY, occupancy_from_logits
-from leco_plugin.models.losses import expert_shares
+from leco_plugin.models.losses import expert_statistics
 from leco_plugin.models.rendering import MET, Intervals, Rays, Shaded, backdrop_of, sum_up
 from leco_plugin.samplers.packed import accumulate_along_rays
 from leco_plugin.samplers.rays import candidate_counts
@@ -119,10 +119,7 @@ PRICES = ("lost_mass", "lost_surface_mass", "image_price_db")
 def gate_statistics(shaded: Shaded, scene_experts: int) -> dict[str, Tensor]:
     """Samples per ray, and for each expert its share of them and their mean density: float scalars.
     Densities are per half extent of the scene."""
-    num_samples = max(len(shaded.routes), 1)
-    shares = expert_shares(shaded.routes, 1 + scene_experts)
-    density = torch.zeros_like(shares).index_add_(0, shaded.routes, shaded.sigmas.float())
-    density = density / (shares * num_samples).clamp(min=1.0)
+    shares, density = expert_statistics(shaded.routes, shaded.sigmas, 1 + scene_experts)
     figures = {"samples_per_ray": shaded.packed_info[:, 1].float().mean()}
     for expert in range(1 + scene_experts):
         figures[f"share_expert_{expert}"] = shares[expert]

@@ -99,10 +99,10 @@ def shade_in_torch(scene: Scene, rays: Rays, intervals: Intervals) -> tuple[Shad
     first = asked_first(intervals, starts)
     lit = torch.zeros_like(first)
     asked: list[Tensor] = []
-    heard: list[Answers] = []
+    parts: list[Answers] = []
 
-    def hear(part: Tensor) -> None:
-        if heard and not len(part):
+    def ask_about(part: Tensor) -> None:
+        if parts and not len(part):
             return
         some = Intervals(*(values.index_select(0, part) for values in intervals))
         answers = ask(scene, rays, some, freeze_gate=True)
@@ -111,18 +111,18 @@ def shade_in_torch(scene: Scene, rays: Rays, intervals: Intervals) -> tuple[Shad
         depths.index_add_(0, some.ray_indices, absorbed)
         lit[part] = ~(-(-absorbed).expm1() < FAINT)
         asked.append(part)
-        heard.append(answers)
+        parts.append(answers)
 
     for begin in range(0, max(longest, 1), at_once):
         going_on = (counts[alive] > begin) & (depths[alive] <= opaque)
         alive = alive[going_on]
         left = (counts[alive] - begin).clamp(max=at_once)
         part = samples_of(starts[alive] + begin, left, at_once)
-        hear(part[first[part]])
+        ask_about(part[first[part]])
         between = part[~first[part]]
-        hear(between[lit[between - 1] | lit[between + 1]])
+        ask_about(between[lit[between - 1] | lit[between + 1]])
     together, order = torch.cat(asked).sort()
-    answers = Answers(*(torch.cat(values).index_select(0, order) for values in zip(*heard)))
+    answers = Answers(*(torch.cat(values).index_select(0, order) for values in zip(*parts)))
     seen = Intervals(*(values.index_select(0, together) for values in intervals))
     return render(scene.field.color, answers, rays, seen, scene.space.half_extent), seen
 

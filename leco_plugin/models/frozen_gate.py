@@ -60,11 +60,9 @@ def occupancy_of(gate: Gate, mapped: Tensor, dtype: torch.dtype) -> Tensor:
     with torch.no_grad(), torch.autocast("cpu", enabled=False):
         if dtype == torch.float32 and gate.suits_native(mapped):
             return gate.occupancy(mapped)
-    count = len(mapped)
-    filling = filled_size(count) - count
-    if filling:
-        mapped = torch.nn.functional.pad(mapped.T, (0, filling)).T
-    with torch.no_grad(), torch.autocast("cpu", enabled=False):
+        count = len(mapped)
+        if filling := filled_size(count) - count:
+            mapped = torch.nn.functional.pad(mapped.T, (0, filling)).T
         folded = folded_gate(gate, dtype)
         encoding = gate.encoding
         is_known = isinstance(encoding, FrequencyEncoding)

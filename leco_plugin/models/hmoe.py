@@ -69,7 +69,7 @@ class HMoE(nn.Module):
     """h(x) = G_i*(x) E_i*(x): each point through the one expert it is routed to.
 
     Attributes:
-        left: bool [n], which scene experts remain. Saved in the state dict.
+        left: bool [n], which scene experts are left over: not dropped. Saved in the state dict.
     """
 
     left: Tensor

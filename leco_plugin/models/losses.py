@@ -24,6 +24,14 @@ def expert_shares(routes: Tensor, num_experts: int) -> Tensor:
     return torch.bincount(routes, minlength=num_experts).float() / max(len(routes), 1)
 
 
+def expert_statistics(routes: Tensor, sigmas: Tensor, num_experts: int) -> tuple[Tensor, Tensor]:
+    """`expert_shares`, and the mean density of each expert's points in the unit of `sigmas` [N], 0
+    of none; both [num_experts] float32."""
+    shares = expert_shares(routes, num_experts)
+    sums = torch.zeros_like(shares).index_add_(0, routes, sigmas.float())
+    return shares, sums / (shares * len(routes)).clamp(min=1.0)
+
+
 def imbalanced_gate_loss(probabilities: Tensor, routes: Tensor, empty_ratio: float) -> Tensor:
     """L_g = sum_i w_i f_i P_i with w_0 = 1 / rho and w_i = n / (1 - rho), P_i = mean_x G_i(x).
 
@@ -71,8 +79,8 @@ def color_loss(rgb: Tensor, truth: Tensor) -> Tensor:
 
 
 def adjoining(intervals: Intervals) -> Tensor:
-    """Whether each sample but the first follows the one before it on a ray, with no other left out
-    between them: bool [M - 1]."""
+    """Whether each sample but the first lies on the ray of the one before it, with no gap of half a
+    step between them: bool [M - 1]."""
     rays, starts, ends = intervals
     return (rays[1:] == rays[:-1]) & (2.0 * starts[1:] < 3.0 * ends[:-1] - starts[:-1])
 
@@ -126,15 +134,15 @@ def contribution_loss(
 
 
 def agreement_loss(weights: Tensor, occupancies: Tensor, empty_below: float) -> Tensor:
-    """Rendering weight at places that the gate calls empty: sum of w max(0, 1 - o / empty_below).
+    """Rendering weight where the gate says empty: sum of w max(0, 1 - o / empty_below).
 
-    The gate, being smooth, does not follow single specks of density that explain single pixels; the
-    field gives them up. Only the field is taught.
+    It teaches the field alone, to give up single specks of density that explain single pixels: a
+    smooth gate does not follow them. The caller divides the sum by the number of rays.
 
     Args:
         weights: [N] rendering weights.
         occupancies: [N] o(x).
-        empty_below: o(x) from which the gate has no doubt left.
+        empty_below: o(x) from which weight costs nothing.
     """
     doubt = (1.0 - occupancies.detach() / empty_below).clamp(min=0.0)
     return (weights * doubt).sum()
@@ -145,15 +153,15 @@ def termination_loss(
 ) -> Tensor:
     """Rays with a known distance end there: mean of -log(weight within one step of it + floor).
 
-    After the ray termination loss of DS-NeRF (Deng et al. 2022, eq. 6). The floor lets go of rays
-    that plainly end before: some points are seen through what hides them.
+    After the ray termination loss of DS-NeRF (Deng et al. 2022, eq. 6). Some points are seen
+    through what hides them: the floor bounds the gradient of rays that end long before.
 
     Args:
         weights: [M] rendering weights.
         intervals: [M] packed, scene units.
         distances: [R] of each ray, scene units; 0 where it is not known.
     Returns:
-        Scalar; zero when no distance is known.
+        Scalar, -log(1 + floor) at least; zero when no distance is known.
     """
     known = distances.index_select(0, intervals.ray_indices)
     middles = 0.5 * (intervals.t_starts + intervals.t_ends)
@@ -166,16 +174,14 @@ def termination_loss(
 def backdrop_loss(
     weights: Tensor, is_backdrop: Tensor, ray_indices: Tensor, wanted: Tensor, counts: Tensor
 ) -> Tensor:
-    """Backdrops weigh what is known of them: mean of the squared difference over all rays.
-
-    What is seen through a pixel of opacity a weighs 1 - a. Where ground is met, nothing is left.
+    """Squared difference of each backdrop's weight from a wanted one, mean over all rays.
 
     Args:
         weights: [M] rendering weights.
         is_backdrop: bool [M].
         ray_indices: [M] int64.
-        wanted: [R] in [0, 1].
-        counts: [R] in [0, 1], how much each ray counts; one without a backdrop does not.
+        wanted: [R] in [0, 1]: 1 - a behind a pixel of opacity a, 0 where the ray meets ground.
+        counts: [R] in [0, 1], how much each ray counts. Rays without a backdrop add nothing.
     """
     last = is_backdrop.nonzero()[:, 0]
     rays = ray_indices.index_select(0, last)

@@ -243,10 +243,10 @@ class Mixture(nn.Module):
         self._estimator = ()
 
     def restart_field(self) -> None:
-        """Gives the field the weights of a new one; scene experts that left stay away."""
+        """Gives the field the weights of a new one; dropped scene experts stay dropped."""
         fresh = HMoEField(self.field.config, self.num_images)
-        for number, left in enumerate(self.field.experts.left.tolist(), 1):
-            if not left:
+        for number, remains in enumerate(self.field.experts.left.tolist(), 1):
+            if not remains:
                 fresh.experts.drop(number)
         self.field.load_state_dict(fresh.state_dict())
 
@@ -256,11 +256,9 @@ class Mixture(nn.Module):
 
     def occupancy(self) -> Occupancy:
         """The gate that skips as an `Occupancy`; it shares the gate's parameters."""
-        gate, region = self.small or self.gate, self.region
-        threshold, walls = float(self.threshold), region.aabb
-        said = self.precision, self.report
-        made = Occupancy(gate, region.space, threshold, *said, walls, region.seen)
-        return made.to(self.device)
+        gate, region, said = self.small or self.gate, self.region, (self.precision, self.report)
+        given = region.space, float(self.threshold), *said, region.aabb, region.seen
+        return Occupancy(gate, *given).to(self.device)
 
     def estimator(self) -> LearnedOccupancyEstimator:
         """Samples where the frozen gate says so; built on first use, also after a checkpoint.

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from leco_plugin.models.leco_config import LecoModelConfig
 
 DARK = 0.1
-"""Brightness, of the largest channel, from which a pixel of a bounded scene shows something."""
+"""Largest channel, in [0, 1], from which a pixel is not dark. A dark one may show nothing."""
 
 
 @dataclass
@@ -90,25 +90,25 @@ def field_losses(
     learning: bool,
     ramped: float,
 ) -> dict[str, Tensor]:
-    """Weighted losses of one batch that the field answers for, by name.
+    """Weighted losses of one batch that teach the field, by name.
 
     Args:
         truth: [R, 3] colours.
-        opacities: [R] of the pixels; None where all are opaque.
+        opacities: [R] of the pixels, in [0, 1]; None where all are opaque.
         distances: [R] to sparse points, scene units, 0 where none is known; None is no such points.
-        grounded: bool [R], which rays are known to meet ground.
+        grounded: bool [R], which rays would end below the ground.
         span: near and far, scalars, scene units.
         unbounded: scalar bool, whether a ray may go on to a sky of any colour; in a box nothing but
             darkness lies behind the scene.
-        learning: whether this is the first phase.
-        ramped: how far the distortion loss has come in, in [0, 1]; nearness and ground come in with
-            it.
+        learning: whether this is a step of the first phase.
+        ramped: see `schedule.ramp`: of distortion, nearness and ground.
     """
     losses = {"rgb_loss": color_loss(shaded.rgb, truth)}
     near, far = span
+    backdrops = shaded.weights, backdrop_of(intervals, rays), intervals.ray_indices
     if weights.transparency > 0.0 and opacities is not None:
         losses["transparency_loss"] = weights.transparency * backdrop_loss(
-            *_backdrops(shaded, intervals, rays), 1.0 - opacities, (opacities < 1.0).to(opacities)
+            *backdrops, 1.0 - opacities, (opacities < 1.0).to(opacities)
         )
     distortion = weights.distortion * ramped * (1.0 if learning else weights.distortion_after)
     if distortion > 0.0:
@@ -121,9 +121,9 @@ def field_losses(
     dark = (1.0 - truth.amax(dim=-1) / DARK).clamp(min=0.0)
     ground = weights.ground * ramped
     if ground > 0.0:
-        opaque = (1.0 - dark) * (1.0 if opacities is None else opacities >= 1.0)
+        shows = (1.0 - dark) * (1.0 if opacities is None else opacities >= 1.0)
         losses["ground_loss"] = ground * backdrop_loss(
-            *_backdrops(shaded, intervals, rays), torch.zeros_like(opaque), opaque * grounded
+            *backdrops, torch.zeros_like(shows), shows * grounded
         )
     if weights.termination > 0.0 and distances is not None:
         losses["termination_loss"] = weights.termination * termination_loss(
@@ -133,11 +133,6 @@ def field_losses(
         nearness = (far - shaded.depth) / (far - near) * torch.where(unbounded, 1.0, dark)
         losses["nearness_loss"] = weights.nearness * ramped * nearness.mean()
     return losses
-
-
-def _backdrops(shaded: Shaded, intervals: Intervals, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
-    """Rendering weights [M], which of them are backdrops', and their rays."""
-    return shaded.weights, backdrop_of(intervals, rays), intervals.ray_indices
 
 
 def gate_losses(
@@ -150,48 +145,45 @@ def gate_losses(
     *,
     ramped: float,
 ) -> dict[str, Tensor]:
-    """Weighted losses of one batch, by name.
+    """Weighted losses of one batch that teach the gate, and agreement, which teaches the field.
 
     Args:
         half_extent: scalar, scene units in the unit of density.
         homogeneous: only the balance among the scene experts.
-        ramped: how far the distortion loss has come in, in [0, 1]; agreement comes in with it.
+        ramped: see `schedule.ramp`: of agreement.
     """
-    logits, routes = shaded.logits, shaded.routes
-    on_scene = (routes > 0).nonzero()[:, 0]
-    balance = logits.new_zeros(())
-    if len(on_scene) > 0 and logits.shape[-1] > 2:
-        probabilities = logits[on_scene, 1:].softmax(dim=-1)
-        balance = config.balance * balance_loss(probabilities, routes[on_scene] - 1)
+    routes, balance = shaded.routes, {}
+    if homogeneous or config.form == "logit":
+        balance["balance_loss"] = config.balance * _scene_balance(shaded.logits, routes)
     if homogeneous:
-        return {"balance_loss": balance}
+        return balance
     # the backdrop is kept anyway, and says nothing about where a ray happens to end
     before = (~backdrop_of(intervals, rays)).nonzero()[:, 0]
+    logits = shaded.logits.index_select(0, before)
+    intervals = Intervals(*(part.index_select(0, before) for part in intervals))
     if config.form == "logit":
-        weights = widen(
-            shaded.weights.detach().index_select(0, before),
-            adjoining(Intervals(*(part.index_select(0, before) for part in intervals))),
-        )
-        contribution = contribution_loss(
-            logits.index_select(0, before), weights, config.weight_at_full, config.emphasis
-        )
-        agreement = agreement_loss(
-            shaded.weights.index_select(0, before),
-            occupancy_from_logits(logits.index_select(0, before)),
-            config.empty_below,
-        ) / len(rays.origins)
+        weights = shaded.weights.index_select(0, before)
+        targets = widen(weights.detach(), adjoining(intervals))
+        contribution = contribution_loss(logits, targets, config.weight_at_full, config.emphasis)
+        agreement = agreement_loss(weights, occupancy_from_logits(logits), config.empty_below)
         return {
-            "agreement_loss": config.agreement * ramped * agreement,
+            "agreement_loss": config.agreement * ramped * (agreement / len(rays.origins)),
             "contribution_loss": config.contribution * contribution,
-            "balance_loss": balance,
-        }
-    probabilities = logits.index_select(0, before).softmax(dim=-1)
-    routes = routes.index_select(0, before)
+        } | balance
+    probabilities, routes = logits.softmax(dim=-1), routes.index_select(0, before)
     lengths = (intervals.t_ends - intervals.t_starts) / half_extent
-    alphas = (1.0 - torch.exp(-shaded.sigmas * lengths)).index_select(0, before)
+    alphas = 1.0 - torch.exp(-shaded.sigmas.index_select(0, before) * lengths)
     equal_shares = 1.0 / probabilities.shape[-1]
     empty_ratio = equal_shares if config.empty_ratio is None else config.empty_ratio
     return {
         "gate_loss": config.imbalance * imbalanced_gate_loss(probabilities, routes, empty_ratio),
         "density_loss": config.density * density_loss(probabilities[:, 0], alphas),
     }
+
+
+def _scene_balance(logits: Tensor, routes: Tensor) -> Tensor:
+    """`balance_loss` among the scene experts; 0 where there is only one, or none has a point."""
+    on_scene = (routes > 0).nonzero()[:, 0]
+    if len(on_scene) == 0 or logits.shape[-1] == 2:
+        return logits.new_zeros(())
+    return balance_loss(logits[on_scene, 1:].softmax(dim=-1), routes[on_scene] - 1)

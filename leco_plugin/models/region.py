@@ -86,13 +86,14 @@ class Region(nn.Module):
 
     @torch.no_grad()
     def note_backdrops(self, origins: Tensor, directions: Tensor) -> None:
-        """Notes where rays [N, 3] that cover the training images leave the scene."""
+        """Notes in which directions training sees backdrops, from rays [N, 3] that cover its
+        images: origins in scene units, unit directions."""
         cut = self.cut(origins.to(self.aabb), directions.to(self.aabb))
         self.backdrops.note(cut, ~self.leaves_by_floor(cut))
 
     @torch.no_grad()
     def note_crossed_space(self, origins: Tensor, directions: Tensor) -> None:
-        """Notes the space that rays [N, 3] cross, which cover all training images."""
+        """Notes the space that training sees, from rays as of `note_backdrops`, of all images."""
         cut = self.cut(origins.to(self.aabb), directions.to(self.aabb))
         self.seen.note(self.space, marching.Rays(*cut[:4]))
 
@@ -112,7 +113,8 @@ class Region(nn.Module):
         Args:
             origins, directions: [R, 3], scene units and unit vectors.
             images: [R] int64 of training images, or None.
-            length: scalar, of the sky, scene units.
+            length: scalar, scene units, of what is left of a ray that misses the box; at most a
+                step, so that nothing but its backdrop is shaded.
             crop: nears and fars of the rays, [R] or [R, 1], scene units; None is no crop.
         """
         rays = self.cut(origins, directions, images)
@@ -225,8 +227,8 @@ def cut_rays(
 
 
 def with_ends_for_all(rays: Rays, far: Tensor, length: Tensor) -> Rays:
-    """Gives rays that miss the bounds a piece as long as a backdrop at the far end: their sky. The
-    piece of a ray without a backdrop has no length."""
+    """Rays, of which those that miss the bounds keep the last `length` before `far`, scene units: a
+    backdrop that shows their sky. Where `cut_off` says that they have none, it has no length."""
     missed = ~(rays.t_maxs > rays.t_mins)
     starts = far - length
     starts = starts if rays.cut_off is None else torch.where(rays.cut_off, far, starts)

@@ -101,7 +101,7 @@ class Scene(NamedTuple):
 
 
 def gate_values_and_routes(
-    logits: Tensor, routing: Routing, left: Tensor | None = None
+    logits: Tensor, routing: Routing, remaining: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """The factor of each sample's features [M] float32, and its expert [M] int64.
 
@@ -110,23 +110,22 @@ def gate_values_and_routes(
 
     Args:
         logits: [M, 1 + n].
-        left: bool [n], scene experts that were not dropped; None is all of them.
+        remaining: bool [n], scene experts that were not dropped; None is all of them.
     """
-    gate_values, routes = _of_all_experts(logits, routing)
-    if left is not None:
+    gate_values, routes = _values_and_routes(logits, routing)
+    if remaining is not None:
         scene = logits[:, 1:]
-        best = scene.masked_fill(~left[: scene.shape[-1]], -torch.inf).argmax(dim=-1) + 1
+        best = scene.masked_fill(~remaining[: scene.shape[-1]], -torch.inf).argmax(dim=-1) + 1
         routes = torch.where(routes == EMPTY, EMPTY, best)
     return gate_values, routes
 
 
-def _of_all_experts(logits: Tensor, routing: Routing) -> tuple[Tensor, Tensor]:
-    """As above, while no expert has been dropped.
+def _values_and_routes(logits: Tensor, routing: Routing) -> tuple[Tensor, Tensor]:
+    """`gate_values_and_routes` while all scene experts remain.
 
-    The paper's factor is G_i*(x), which jumps when a sample changes from an expert to another. With
-    a threshold rule the factor is one, and its gradient that of the logarithm of the scene expert's
-    share (straight-through): a route that changes then changes the image little. In a homogeneous
-    mixture the factor is that share.
+    The paper's factor is G_i*(x), which jumps where a sample changes experts. With `empty_below`
+    the factor is 1, with the gradient of log(share of the scene expert) (straight-through), so that
+    a changed route changes the image little. In a homogeneous mixture the factor is that share.
     """
     if routing.empty_below is None and not routing.homogeneous:
         routes = route(logits, None)
@@ -233,8 +232,8 @@ def ask(scene: Scene, rays: Rays, intervals: Intervals, freeze_gate: bool) -> An
     mapped = mapped_middles(scene.space, rays, intervals)
     with torch.set_grad_enabled(torch.is_grad_enabled() and not freeze_gate):
         logits = scene.gate(mapped)
-        left = scene.field.experts.remaining_experts()
-        gate_values, routes = gate_values_and_routes(logits, scene.routing, left)
+        remaining = scene.field.experts.remaining_experts()
+        gate_values, routes = gate_values_and_routes(logits, scene.routing, remaining)
     sigmas, features = scene.field.density(mapped, routes, gate_values)
     return Answers(sigmas, features, logits, routes)
 

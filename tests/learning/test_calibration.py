@@ -31,7 +31,7 @@ from leco_plugin.learning.dense import (
     near_median_depth,
     near_surface,
     reference_of,
-    weighed,
+    weights_by_ray,
 )
 from leco_plugin.models.rendering import Intervals, Rays, Shaded
 from leco_plugin.occupancy import CAMERAS_THAT_VOUCH
@@ -371,9 +371,9 @@ def test_before_a_backdrop_that_holds_the_median_there_is_no_surface() -> None:
     hazy, solid, thin = [0.0, 0.2, 0.2, 0.6], [0.0, 0.7, 0.1, 0.2], [0.5, 0.0, 0.0, 0.5]
     shaded = shaded_of(torch.tensor([*hazy, *solid, *thin]), ray_indices, torch.ones(3))
     backdrops = torch.tensor([False, False, False, True]).repeat(3)
-    near = near_surface(*weighed(shaded), intervals, backdrops)
+    near = near_surface(*weights_by_ray(shaded), intervals, backdrops)
     assert near.view(3, 4).tolist() == [[False] * 4, [True] * 4, [True, True, True, False]]
-    everywhere = near_surface(*weighed(shaded), intervals, torch.zeros(12, dtype=torch.bool))
+    everywhere = near_surface(*weights_by_ray(shaded), intervals, torch.zeros(12, dtype=torch.bool))
     assert torch.equal(everywhere, near_median_depth(shaded, intervals))
 
 
@@ -394,7 +394,7 @@ def test_no_samples_have_no_median() -> None:
     none, no_rays = torch.zeros(0), torch.zeros(0, dtype=torch.int64)
     shaded, nothing = shaded_of(none, no_rays, torch.zeros(3)), Intervals(no_rays, none, none)
     assert near_median_depth(shaded, nothing).shape == (0,)
-    assert near_surface(*weighed(shaded), nothing, none.bool()).shape == (0,)
+    assert near_surface(*weights_by_ray(shaded), nothing, none.bool()).shape == (0,)
 
 
 @settings(deadline=None, max_examples=30)
