@@ -261,6 +261,7 @@ def test_other_records_are_refused(tmp_path: Path, other: dict[str, bytes], mess
         (gzip.compress(struct.pack("<QI", 9, 0) + b"\x0a\xffabc"), "cut off|another form"),
         (gzip.compress(b"abc"), "error"),
     ],
+    ids=["no-gzip", "long", "cut-off", "short"],
 )
 def test_other_files_are_refused(tmp_path: Path, content: bytes, message: str) -> None:
     write(tmp_path / "records", "train.tfrecord").write_bytes(content)
