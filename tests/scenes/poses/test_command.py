@@ -252,14 +252,14 @@ def test_a_folder_that_a_full_disk_left_without_files_can_be_used(
 
 
 def test_a_folder_with_something_else_is_refused_before_any_work(
-    pycolmap: Any, photos: Path, tiny_scene: Path
+    pycolmap: Any, photos: Path, tiny_scene: Path, tmp_path: Path
 ) -> None:
     with pytest.raises(InputError, match="holds something else: give another folder"):
         make_scene(photos, tiny_scene)
-    (tiny_scene / "colmap").mkdir()
-    (tiny_scene / "colmap" / "asked.json").write_text('{"format"')
+    (tmp_path / "colmap").mkdir()
+    (tmp_path / "colmap" / "asked.json").write_text('{"format"')
     with pytest.raises(InputError, match=r"asked\.json is damaged .*: give another folder"):
-        make_scene(photos, tiny_scene)
+        make_scene(photos, tmp_path)
 
 
 def test_without_pycolmap_one_line_says_how_to_install_it(
