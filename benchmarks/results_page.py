@@ -85,13 +85,13 @@ learning what is empty takes part of the time, and wins it back. On a CPU hosts 
 nerfstudio's: a hash table of 2^16 entries, a grid of 64³, 128 + 64 proposal samples and 32 of the
 field.
 
+{gifts}
+
 {stretch}
 
 {five_minutes}
 
 {half_hour}
-
-{gifts}
 
 The demo's city is known exactly, which photographs never are:
 """

@@ -40,7 +40,7 @@ REAL = re.compile(r"^real (\d+)", re.MULTILINE)
 """The seconds of a command, at the end of its log."""
 PROGRESS, SHOWN_AT = re.compile(r"Training: (\d+)%"), 25
 """Of lines on the training the one nearest to this share is shown."""
-QUOTED = ("are placed", "in metres by", "a gate of", "finished:")
+QUOTED = ("are placed", "finished:")
 """What README shows of it."""
 VOUCHED = re.compile(r"(\d+) photographs that taught it nothing")
 
@@ -115,9 +115,9 @@ def quote(report: dict[str, Any]) -> str:
         [
             block(chosen),
             "",
-            f"All three took {minutes:.0f} minutes on two CPU cores. A learned gate skipped first, "
-            "then its smaller successor. Both together hide "
-            f"{costs['lost_surface_mass']:.2%} of the surfaces in held-out pixels. Of "
+            f"All three took {minutes:.0f} minutes on two CPU cores. At the end "
+            f"{costs['empty_fraction']:.0%} of all places on rays are skipped. The gates of this "
+            f"run hide {costs['lost_surface_mass']:.2%} of the surfaces in held-out pixels. Of "
             f"{photographs} that taught them nothing, the worst lost {worst[0]:.1%}"
             + "".join(f" ({other:.1%} in another run)" for other in worst[1:])
             + ".",

@@ -88,12 +88,13 @@ def test_what_is_around_the_tables_is_left_as_it_is(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(parts, "lead", lambda chart: "lead")
     monkeypatch.setattr(parts, "gain_table", lambda chart: "table")
     monkeypatch.setattr(parts, "in_the_same_time", lambda chart, most=None: "gain")
+    monkeypatch.setattr(parts, "on_a_city", lambda: "city")
     monkeypatch.setattr(parts, "without_gifts", lambda chart: "alone")
     monkeypatch.setattr(parts, "after_half_an_hour", lambda: "late")
     monkeypatch.setattr(parts, "of_the_papers_host", lambda: "")
     (before, after), (begin, end) = parts.DEMO, parts.GAIN
     text = f"A\n{before}\nstale\n{after}\nB\n{begin}\n{end}\nC\n"
-    parts_of_gain = "lead\n\ntable\n\n- gain\n- alone\n- late"
+    parts_of_gain = "lead\n\ntable\n\n- gain city\n- alone\n- late"
     expected = f"A\n{before}\ndemo\n{after}\nB\n{begin}\n{parts_of_gain}\n{end}\nC\n"
     assert parts.readme(text) == expected
 

@@ -33,16 +33,20 @@ def test_a_page_quotes_what_is_ours_and_one_line_on_progress() -> None:
 
 
 def test_the_readme_says_what_skipping_costs_and_what_another_run_lost() -> None:
-    lines = {"train": ["step 9: a gate of 7 values", "x"], "poses": ["2 of 3 are placed"]}
+    lines = {"poses": ["2 of 3 are placed"], "train": ["a gate of 7 values", "finished: 9 steps"]}
     report = {
         "lines": lines,
         "seconds": {"poses": 60, "train": 100, "film": 20, "eval": 900},
-        "costs": {"lost_surface_mass": 7.8e-4, "worst_surface_mass": 0.0128},
+        "costs": {
+            "empty_fraction": 0.77,
+            "lost_surface_mass": 7.8e-4,
+            "worst_surface_mass": 0.0128,
+        },
         "other_runs": [{"worst_surface_mass": 0.021}],
     }
     said = walk.quote(report)
-    assert said.startswith("```\nstep 9: a gate of 7 values\n2 of 3 are placed\n```\n\n")
-    assert "took 3 minutes" in said and "hide 0.08%" in said
+    assert said.startswith("```\n2 of 3 are placed\nfinished: 9 steps\n```\n\n")
+    assert "took 3 minutes" in said and "77% of all places" in said and "hide 0.08%" in said
     assert said.endswith(
         "Of photographs that taught them nothing, the worst lost 1.3% (2.1% in another run)."
     )
