@@ -99,7 +99,7 @@ def test_the_code_of_the_readme_needs_no_more_than_a_file(
     (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     given: dict[str, Any] = {}
     exec(code, given)
-    assert given["kept"].dtype == torch.bool and len(given["kept"]) == len(given["t_starts"])
+    assert len(given["ray_indices"]) == len(given["t_starts"]) == len(given["t_ends"])
 
 
 def test_it_names_the_samplers_of_packed_hosts() -> None:
