@@ -115,7 +115,7 @@ def poses(
         threads: Of the CPU. 0 takes all.
         json: Another file for poses.json.
     """
-    check_place("--json", json)
+    check_report(json, out)
     from leco_plugin.scenes.poses.command import make_scene, summary
 
     report = make_scene(photos, out, lens, size, threads)
@@ -141,7 +141,7 @@ def rays(
         out: Folder of the scene: pictures and transforms.json.
         json: File for what was fitted, as JSON.
     """
-    check_place("--json", json)
+    check_report(json, out)
     from leco_plugin.scenes.block_nerf import make_scene, summary
 
     report = make_scene(records, out)

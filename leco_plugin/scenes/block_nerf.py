@@ -7,7 +7,9 @@ lens is fitted to rays of some pictures of each camera, then a rotation to those
 from __future__ import annotations
 
 import gzip
+import hashlib
 import io
+import os
 import shutil
 import struct
 import zlib
@@ -22,13 +24,13 @@ from PIL import Image
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from leco_plugin.log import bar, resumable
+from leco_plugin.log import bar, counted, resumable
 from leco_plugin.scenes.input_error import InputError, one_line, require_folder
 from leco_plugin.scenes.locks import alone_in
-from leco_plugin.scenes.whole_files import write_json, write_whole
+from leco_plugin.scenes.whole_files import remove_parts, write_json, write_whole
 
 Array = NDArray[np.float64]
-SCENE, READ = "transforms.json", "read"
+SCENE, READ = "transforms.json", "leco-rays"
 """In the folder of the scene: what is written last; until then a folder of what each file gave."""
 INTRINSICS = ("fl_x", "fl_y", "cx", "cy")
 DISTORTION = ("k1", "k2", "p1", "p2")
@@ -43,10 +45,8 @@ NO_CAMERA = 0.05
 """Of the width: rays that are farther from every lens are those of no such camera."""
 LONGEST = 1 << 31
 """Bytes of a record: none has more."""
-CLOSE = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
-"""When to end undoing distortion, step by step."""
-
-
+FAULTS = (EOFError, ValueError, LookupError, struct.error, zlib.error, gzip.BadGzipFile)
+"""What files of something else raise when they are read."""
 RAYS = np.dtype(
     [
         *(("name", "U40"), ("camera", "i8"), ("width", "i8"), ("height", "i8"), ("test", "?")),
@@ -58,8 +58,9 @@ there at most, and directions of length 1 of the rays of ACROSS x DOWN of its pi
 
 
 def make_scene(records: Path, out: Path) -> dict[str, Any]:
-    """Writes pictures and cameras of a folder of records; returns what was fitted. Goes on with
-    what a killed run has left. InputError for other files, or an `out` with a scene."""
+    """Writes pictures and cameras of a folder of records; returns what was fitted. A picture that
+    stands twice counts once, for testing if one of the two is. Goes on with what a killed run has
+    left. InputError for other files, or an `out` with a scene."""
     require_folder(records, "give that of the records, *.tfrecord*")
     files = sorted(path for path in records.rglob("*.tfrecord*") if path.is_file())
     if all("validation" in path.name for path in files):
@@ -67,32 +68,43 @@ def make_scene(records: Path, out: Path) -> dict[str, Any]:
     with alone_in(out, "scene"), resumable(), bar("Reading the records") as show:
         if (out / SCENE).exists():
             raise InputError(f"--out {out} holds a scene already: give another folder")
+        remove_parts(out)
         found = []
         for number, path in enumerate(files):
-            kept = out / READ / f"{path.relative_to(records)}.npy"
+            kept = out / READ / f"{_digest(path)}.npy"
             if kept.is_file():
                 found.append(np.load(kept))
             else:
                 found.append(np.array([*_read(path, out)], dtype=RAYS))
                 write_whole(kept, lambda file, rays=found[-1]: np.save(file, rays))  # type: ignore[misc]
             show((number + 1) / len(files))
-        report = _write_scene(out, np.sort(np.concatenate(found), order="name"))
+        pictures = np.sort(np.concatenate(found), order=("name", "test"))
+        names = pictures["name"]
+        report = _write_scene(out, pictures[np.append(names[1:] != names[:-1], True)])
         shutil.rmtree(out / READ)
     return report
 
 
 def summary(report: dict[str, Any]) -> Iterator[str]:
     """Lines that say what a report says."""
-    pictures, cameras, error = report["pictures"], report["cameras"], report["error"]
-    yield f"{pictures} pictures of {cameras} cameras, {report['test_pictures']} of them for testing"
+    error, tests = report["error"], report["test_pictures"]
+    pictures = counted(report["pictures"], "picture")
+    yield f"{pictures} of {counted(report['cameras'], 'camera')}, {tests} of them for testing"
     worst = f"{error['worst']:.2f} at worst, in {report['worst']}"
     yield f"rays lie {error['median']:.2f} pixels from their pixels (median over pictures), {worst}"
     yield f"rays of one picture begin up to {report['moved']:.3g} from its camera's place"
 
 
+def _digest(path: Path) -> str:
+    """Another one for another file, also where that has taken the name of this one."""
+    known = path.stat()
+    said = f" {known.st_size} {known.st_mtime_ns}".encode()
+    return hashlib.blake2b(os.fsencode(path.resolve()) + said, digest_size=8).hexdigest()
+
+
 def _write_scene(out: Path, pictures: NDArray[Any]) -> dict[str, Any]:
     """Fits cameras to the rays of pictures [P], and writes transforms.json; returns the report."""
-    kinds = [(int(each["camera"]), int(each["width"])) for each in pictures]
+    kinds = [tuple(map(int, each[["camera", "width", "height"]])) for each in pictures]
     lenses = {kind: best_lens(pictures[[k == kind for k in kinds]]) for kind in sorted({*kinds})}
     frames, errors = [], []
     for kind, rays in zip(kinds, pictures):
@@ -141,20 +153,19 @@ def fit_lens(rays: np.void) -> tuple[dict[str, float], float]:
     ends, places = directions.reshape(DOWN, ACROSS, 3), pixels.reshape(DOWN, ACROSS, 2)
     y, x = DOWN // 2, ACROSS // 2
     focal = [
-        np.linalg.norm(places[far] - places[y, x]) / np.linalg.norm(ends[far] - ends[y, x])
+        np.linalg.norm(places[far] - places[y, x])
+        / max(float(np.linalg.norm(ends[far] - ends[y, x])), 1e-9)
         for far in ((y, x + 1), (y + 1, x))
     ]
     first = np.array([*focal, width / 2, height / 2])
-    turn = _turn_to(_through(pixels, first, np.zeros(4)), directions).inv().as_rotvec()
 
     def missed(values: Array) -> Array:
-        """Pixels between where rays come from and where this camera has them, one after another."""
-        matrix, distortion = _matrix(values[3:7]), values[7:]
-        seen = cv2.projectPoints(directions, values[:3], np.zeros(3), matrix, distortion)[0]
-        return np.asarray((seen.reshape(-1, 2) - pixels).ravel(), dtype=float)
+        return (_seen(directions, values[:3], values[3:7], values[7:]) - pixels).ravel()
 
     scale = np.array([1.0] * 3 + [float(width)] * 4)
-    fitted = least_squares(missed, np.concatenate([turn, first]), x_scale=scale)
+    fitted = least_squares(
+        missed, np.append(_turn(directions, pixels, first), first), x_scale=scale
+    )
     if _apart(fitted.fun.reshape(-1, 2)) > STRAIGHT:
         start = np.append(fitted.x, np.zeros(len(DISTORTION)))
         fitted = least_squares(missed, start, x_scale=np.append(scale, np.ones(len(DISTORTION))))
@@ -167,12 +178,17 @@ def fit_pose(rays: np.void, lens: dict[str, float]) -> tuple[Array, float]:
     that camera, in pixels (root mean square)."""
     values = np.array([lens[name] for name in INTRINSICS])
     distortion = np.array([lens.get(name, 0.0) for name in DISTORTION])
-    own = _through(_pixels(int(rays["width"]), int(rays["height"])), values, distortion)
-    turn = _turn_to(own, rays["directions"])
+    pixels = _pixels(int(rays["width"]), int(rays["height"]))
+    directions = rays["directions"].astype(float)
+
+    def missed(turn: Array) -> Array:
+        return (_seen(directions, turn, values, distortion) - pixels).ravel()
+
+    fitted = least_squares(missed, _turn(directions, pixels, values))
     pose = np.eye(4)
-    pose[:3, :3] = turn.as_matrix() * [1.0, -1.0, -1.0]
+    pose[:3, :3] = Rotation.from_rotvec(fitted.x).inv().as_matrix() * [1.0, -1.0, -1.0]
     pose[:3, 3] = rays["place"]
-    return pose, _apart((turn.apply(own) - rays["directions"]) * values[:2].mean())
+    return pose, _apart(fitted.fun.reshape(-1, 2))
 
 
 def _pixels(width: int, height: int) -> Array:
@@ -181,26 +197,24 @@ def _pixels(width: int, height: int) -> Array:
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
-def _through(pixels: Array, intrinsics: Array, distortion: Array) -> Array:
-    """Directions [R, 3] of length 1 through pixels [R, 2], in OpenCV's axes: right, down,
-    forward."""
-    matrix, eye = _matrix(intrinsics), np.eye(3)
-    points = cv2.undistortPointsIter(pixels[:, None], matrix, distortion, eye, eye, CLOSE)
-    return _unit(np.column_stack([points.reshape(-1, 2), np.ones(len(pixels))]))
-
-
-def _matrix(intrinsics: Array) -> Array:
+def _seen(directions: Array, turn: Array, intrinsics: Array, distortion: Array) -> Array:
+    """Pixels [R, 2] in which a camera has directions [R, 3] of the world, by the rotation vector
+    that leads to its axes: right, down, forward, as OpenCV's."""
     fx, fy, cx, cy = intrinsics
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    seen = cv2.projectPoints(directions, turn, np.zeros(3), matrix, distortion)[0]
+    return np.asarray(seen.reshape(-1, 2), dtype=float)
+
+
+def _turn(directions: Array, pixels: Array, intrinsics: Array) -> Array:
+    """The rotation vector by which a camera without distortion has directions nearest to pixels."""
+    points = (pixels - intrinsics[2:]) / intrinsics[:2]
+    own = _unit(np.column_stack([points, np.ones(len(points))]))
+    return np.asarray(Rotation.align_vectors(own, directions)[0].as_rotvec(), dtype=float)
 
 
 def _unit(directions: Array) -> Array:
     return directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-
-
-def _turn_to(rays: Array, directions: Array) -> Rotation:
-    """The rotation that leads from rays [R, 3] of a camera nearest to directions in the world."""
-    return Rotation.align_vectors(directions, rays)[0]
 
 
 def _apart(offsets: Array) -> float:
@@ -217,29 +231,37 @@ def _read(path: Path, out: Path) -> Iterator[tuple[Any, ...]]:
                 (length,) = struct.unpack("<Q", head[:8])
                 if length > LONGEST:
                     raise ValueError(f"a record of {length} bytes")
-                name, png, *row = _picture(_fields(file.read(length)))
+                if len(record := file.read(length)) < length:
+                    raise ValueError("a record that is cut off")
+                name, png, *row = _picture(_fields(record))
                 write_whole(out / f"images/{name}.png", lambda to, png=png: to.write(png))  # type: ignore[misc]
                 yield (name, *row[:3], "validation" in path.name, *row[3:])
                 file.read(4)
-    except (EOFError, ValueError, KeyError, struct.error, zlib.error, gzip.BadGzipFile) as error:
+            if not file.tell():
+                raise ValueError("no record")
+    except FAULTS as error:
         said = f"{type(error).__name__}: {one_line(error, 80)}"
         raise InputError(f"{path} is no file of Block-NeRF's records ({said})") from None
 
 
 def _picture(fields: dict[str, list[memoryview]]) -> tuple[Any, ...]:
     """Name, file, camera, width, height, place, movement and directions of a picture by its
-    record's fields. ValueError or KeyError if one is missing or wrong."""
+    record's fields. ValueError or LookupError if one is missing or wrong."""
     camera, known, width, height = (
         _varint(fields[name][0])[0] for name in ("cam_idx", "image_hash", "width", "height")
     )
+    if camera >= 1 << 63:
+        raise ValueError("a camera with a negative number")
     png = bytes(fields["image"][0])
     try:
         with Image.open(io.BytesIO(png)) as image:
             size = image.size
-    except OSError as error:
-        raise ValueError(str(error)) from None
-    if size != (width, height) or min(size) < ACROSS:
+    except (OSError, Image.DecompressionBombError):
+        raise ValueError("no image that can be read") from None
+    if size != (width, height):
         raise ValueError(f"a picture of {size[0]} x {size[1]} for {width} x {height} rays")
+    if min(size) < ACROSS:
+        raise ValueError(f"a picture of {width} x {height}, below {ACROSS} pixels a side")
     x, y = _pixels(width, height).astype(int).T
     origins, directions = (
         np.frombuffer(fields[name][0], "<f4").reshape(height, width, 3)[y, x].astype(float)
@@ -248,10 +270,13 @@ def _picture(fields: dict[str, list[memoryview]]) -> tuple[Any, ...]:
     lengths = np.linalg.norm(directions, axis=1)
     if not (np.isfinite(origins).all() and np.isfinite(lengths).all() and lengths.all()):
         raise ValueError("rays that are not finite, or of length 0")
+    directions = _unit(directions)
+    if np.ptp(directions, axis=0).max() < 1e-6:
+        raise ValueError("rays that all have one direction")
     place = origins.mean(axis=0)
     moved = np.linalg.norm(origins - place, axis=1).max()
     name = f"cam{camera:02d}_{known:016x}"
-    return name, png, camera, width, height, place, moved, _unit(directions)
+    return name, png, camera, width, height, place, moved, directions
 
 
 def _fields(record: bytes) -> dict[str, list[memoryview]]:

@@ -19,6 +19,7 @@ from scene_files import described, refused
 from scipy.spatial.transform import Rotation
 
 from leco_plugin.cli import main
+from leco_plugin.scenes import block_nerf
 from leco_plugin.scenes.block_nerf import make_scene
 from leco_plugin.scenes.city.cameras import look_at
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
@@ -89,8 +90,8 @@ class Shot:
         return _message((1, _message(*entries)))
 
 
-def picture(number: int, width: int = WIDTH) -> bytes:
-    noise = np.random.default_rng(abs(number)).integers(0, 256, (HEIGHT, width, 3), dtype=np.uint8)
+def picture(number: int, width: int = WIDTH, height: int = HEIGHT) -> bytes:
+    noise = np.random.default_rng(abs(number)).integers(0, 256, (height, width, 3), dtype=np.uint8)
     file = io.BytesIO()
     Image.fromarray(noise).save(file, "png")
     return file.getvalue()
@@ -141,11 +142,10 @@ def test_cameras_have_the_rays_of_their_records(records: Path, tmp_path: Path) -
     report = make_scene(records, tmp_path / "scene")
     assert (report["pictures"], report["test_pictures"], report["cameras"]) == (4, 1, 2)
     assert report["error"]["worst"] < 0.01 and report["moved"] < 1e-5
-    shots = {shot.known & (2**64 - 1): shot for shot in (Shot(), Shot(4, 8, bent=BENT))}
-    for frame in described(tmp_path / "scene")["frames"]:
-        shot = shots.get(int(frame["file_path"][-20:-4], 16))
-        if shot is None:
-            continue
+    frames = {frame["file_path"]: frame for frame in described(tmp_path / "scene")["frames"]}
+    assert "images/cam03_fffffffffffffffb.png" in frames and len(frames) == 4
+    for shot in (Shot(), Shot(4, 8, bent=BENT)):
+        frame = frames[f"images/cam{shot.camera:02d}_{shot.known:016x}.png"]
         np.testing.assert_allclose(np.array(frame["transform_matrix"])[:3], shot.pose(), atol=1e-4)
         fitted = [frame[name] for name in ("fl_x", "fl_y", "cx", "cy")]
         np.testing.assert_allclose(fitted, shot.intrinsics(), atol=0.02)
@@ -178,7 +178,7 @@ def test_a_camera_that_moves_is_said(tmp_path: Path, capsys: pytest.CaptureFixtu
     out = tmp_path / "scene"
     assert main(["rays", str(tmp_path / "records"), "--out", str(out)]) == 0
     said = capsys.readouterr().out
-    assert "1 pictures of 1 cameras, 0 of them for testing" in said
+    assert "1 picture of 1 camera, 0 of them for testing" in said
     assert re.search(r"begin up to 0\.25\d* from its camera's place", said)
     assert f"leco points {out}" in said and "train_filenames" not in described(out)
     np.testing.assert_allclose(
@@ -200,26 +200,73 @@ def test_a_car_that_turns_bends_no_lens_of_its_other_pictures(tmp_path: Path) ->
         assert np.abs(off).max() < half + 1e-4
 
 
+def test_a_lens_that_bends_its_rim_strongly_has_the_rays_of_its_pictures() -> None:
+    k1, k2, values = -0.28, 0.06, np.array([700.0, 710.0, 950.0, 650.0])
+    straight = np.linspace(0.0, 4.0, 100_000)
+    bent = straight * (1.0 + k1 * straight**2 + k2 * straight**4)
+    pixels = block_nerf._pixels(1920, 1280)
+    points = (pixels - values[2:]) / values[:2]
+    lengths = np.linalg.norm(points, axis=1, keepdims=True)
+    rays = np.column_stack([points * np.interp(lengths, bent, straight) / lengths, lengths**0])
+    turn = Rotation.from_rotvec([0.3, -2.0, 1.0])
+    row = np.zeros((), block_nerf.RAYS)
+    row["width"], row["height"] = 1920, 1280
+    row["directions"] = turn.apply(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    lens, error = block_nerf.fit_lens(row[()])
+    np.testing.assert_allclose([lens[n] for n in ("fl_x", "fl_y", "cx", "cy")], values, atol=0.01)
+    pose, off = block_nerf.fit_pose(row[()], lens)
+    np.testing.assert_allclose(pose[:3, :3], turn.as_matrix() * [1.0, -1.0, -1.0], atol=1e-5)
+    assert max(error, off) < 0.01
+
+
+def test_pictures_of_other_heights_have_lenses_of_their_own(tmp_path: Path) -> None:
+    origins, directions = (rays[:40] for rays in Shot().rays())
+    image = _message((1, _message((1, picture(9, height=40)))))
+    lower = {"height": _integer(40), "image": image, "ray_origins": _floats(origins)}
+    low = Shot(known=99, other=lower | {"ray_dirs": _floats(directions)})
+    write(tmp_path / "records", "train.tfrecord", Shot(), low)
+    assert make_scene(tmp_path / "records", tmp_path / "scene")["error"]["worst"] < 0.01
+    assert [frame["h"] for frame in described(tmp_path / "scene")["frames"]] == [48, 40]
+
+
+def test_a_picture_that_stands_twice_counts_once_for_testing(records: Path, tmp_path: Path) -> None:
+    write(records, "validation.tfrecord-00001-of-00002", Shot(camera=4, known=8, bent=BENT))
+    report = make_scene(records, tmp_path / "scene")
+    assert (report["pictures"], report["test_pictures"]) == (4, 2)
+
+
 def test_a_killed_run_goes_on(
     records: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole, out = make_scene(records, tmp_path / "whole"), tmp_path / "scene"
+    whole, out = make_scene(records, tmp_path / "whole"), records / "scene"  # in the way of none
     damaged = sorted(records.iterdir())[-1]
     content = damaged.read_bytes()
     damaged.write_bytes(content[:200])
     with refused("validation.tfrecord-00000-of-00001 is no file of Block-NeRF's records"):
         make_scene(records, out)
     assert not (out / "transforms.json").exists()
+    (out / "images" / ".cut-off.part").touch()
     damaged.write_bytes(content)
-    from leco_plugin.scenes import block_nerf
-
     read = block_nerf._read
     asked: list[Path] = []
     monkeypatch.setattr(block_nerf, "_read", lambda *a: asked.append(a[0]) or read(*a))
     assert make_scene(records, out) == whole and asked == [damaged]
     assert described(out) == described(tmp_path / "whole")
+    assert sorted(each.name for each in out.iterdir()) == ["images", "transforms.json"]
+    assert len([*(out / "images").iterdir()]) == 4
     with refused("holds a scene already: give another folder"):
         make_scene(records, out)
+
+
+def test_records_of_another_folder_are_not_taken_for_those_that_were_read(
+    records: Path, tmp_path: Path
+) -> None:
+    damaged = sorted(records.iterdir())[-1]
+    damaged.write_bytes(b"")
+    with refused("no record"):
+        make_scene(records, tmp_path / "scene")
+    write(tmp_path / "other", "train.tfrecord-00000-of-00002", Shot(known=9))
+    assert make_scene(tmp_path / "other", tmp_path / "scene")["pictures"] == 1
 
 
 def _mirrored() -> dict[str, bytes]:
@@ -243,9 +290,15 @@ def _behind() -> dict[str, bytes]:
         ({"ray_dirs": _floats(np.ones(5))}, "cannot reshape"),
         ({"ray_dirs": b""}, "KeyError: 'ray_dirs'"),
         ({"image": _message((1, _message((1, picture(0, 70)))))}, "for 72 x 48 rays"),
-        ({"image": _message((1, _message((1, b"none"))))}, "cannot identify image file"),
+        ({"image": _message((1, _message((1, b"none"))))}, "no image that can be read"),
+        ({"image": _message((1, b""))}, "IndexError"),
+        ({"cam_idx": _integer(-1)}, "negative number"),
+        ({"ray_dirs": _floats(np.ones((HEIGHT, WIDTH, 3)))}, "one direction"),
     ],
-    ids=["mirrored", "panorama", "zero", "nan", "infinite", "few", "none", "size", "no-image"],
+    ids=[
+        *("mirrored", "panorama", "zero", "nan", "infinite", "few", "none", "size", "no-image"),
+        *("empty", "negative", "parallel"),
+    ],
 )
 def test_other_records_are_refused(tmp_path: Path, other: dict[str, bytes], message: str) -> None:
     write(tmp_path / "records", "train.tfrecord", Shot(other=other))
@@ -259,9 +312,11 @@ def test_other_records_are_refused(tmp_path: Path, other: dict[str, bytes], mess
         (b"no gzip", "BadGzipFile"),
         (gzip.compress(b"\x00" * 7 + b"\xff" + bytes(4)), "a record of"),
         (gzip.compress(struct.pack("<QI", 9, 0) + b"\x0a\xffabc"), "cut off|another form"),
-        (gzip.compress(b"abc"), "error"),
+        (gzip.compress(b"abc"), "unpack requires"),
+        (gzip.compress(struct.pack("<QI", 999, 0) + Shot().record()[:99]), "cut off"),
+        (b"", "no record"),
     ],
-    ids=["no-gzip", "long", "cut-off", "short"],
+    ids=["no-gzip", "long", "cut-off", "short", "shorter", "empty"],
 )
 def test_other_files_are_refused(tmp_path: Path, content: bytes, message: str) -> None:
     write(tmp_path / "records", "train.tfrecord").write_bytes(content)
@@ -279,6 +334,8 @@ def test_a_folder_without_records_to_train_on_is_refused(tmp_path: Path) -> None
 
 
 def test_what_was_fitted_is_written_as_json(records: Path, tmp_path: Path) -> None:
-    file = tmp_path / "report.json"
-    assert main(["rays", str(records), "--out", str(tmp_path / "s"), "--json", str(file)]) == 0
+    file, out = tmp_path / "report.json", tmp_path / "s"
+    given = ["rays", str(records), "--out", str(out), "--json"]
+    assert main([*given, str(out / "transforms.json")]) == 2 and not out.exists()
+    assert main([*given, str(file)]) == 0
     assert json.loads(file.read_text())["pictures"] == 4
