@@ -114,12 +114,22 @@ def _orientation(image: Image.Image) -> int:
 def find_file(path: Path) -> Path:
     """A file of that name, of its name with slashes or with letters and accents joined or apart, as
     systems store them, or of one of these with an ending."""
-    slashed = str(path).replace("\\", "/")
-    for name in (str(path), slashed, normalize("NFC", slashed), normalize("NFD", slashed)):
+    for name in _spellings(str(path)):
         for ending in ("", ".png", ".jpg", ".jpeg", ".JPG"):
             if os.path.isfile(name + ending):  # pathlib raises for a name that is too long
                 return Path(name + ending)
     return path
+
+
+def _spellings(name: str) -> Iterator[str]:
+    """How a file of that name may be stored; folders that are there stay as they are spelled."""
+    slashed = name.replace("\\", "/")
+    yield from (name, slashed)
+    there = os.path.dirname(slashed)
+    while there and not os.path.isdir(there):
+        there = os.path.dirname(there)
+    for form in ("NFC", "NFD"):
+        yield there + normalize(form, slashed[len(there) :])
 
 
 def check_images(paths: list[Path]) -> None:
