@@ -85,13 +85,7 @@ learning what is empty takes part of the time, and wins it back. On a CPU hosts 
 nerfstudio's: a hash table of 2^16 entries, a grid of 64³, 128 + 64 proposal samples and 32 of the
 field.
 
-{gifts}
-
-{stretch}
-
-{five_minutes}
-
-{half_hour}
+{further}
 
 The demo's city is known exactly, which photographs never are:
 """
@@ -295,13 +289,8 @@ def page() -> str:
     demo = json.loads((RESULTS / "demo.json").read_text())
     anchor = heading_anchor(titles()[GAIN_CHART])
     gifts = gifts_sentence(stored(GIFTS_CHART), heading_anchor(titles()[GIFTS_CHART]))
-    note = GAIN_NOTE.format(
-        anchor=anchor,
-        gifts=gifts,
-        stretch=new_views(),
-        five_minutes=after_five_minutes(),
-        half_hour=half_an_hour(),
-    )
+    further = "\n\n".join(filter(None, [gifts, new_views(), after_five_minutes(), half_an_hour()]))
+    note = GAIN_NOTE.format(anchor=anchor, further=further)
     parts = [HEAD, f"{gain()}\n", f"{picture(GAIN_CHART)}\n", note]
     parts += [
         f"{demo_table(demo)}\n",
