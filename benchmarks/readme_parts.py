@@ -286,7 +286,8 @@ def _beside(ours: Line, rival: Line, host: str) -> str:
     by = f"{abs(found.difference) if found.word in CLEAR else found.difference:.1f}"
     margin = f"± {found.margin:.1f} dB" if found.margin is not None else f"dB, {found.by}"
     faster, slower = f"{times:.1f} times as fast", f"in {1.0 / times:.1f} times the time"
-    return f"{word} *{name}* by {by} {margin} (renders {faster if times >= 1.0 else slower})"
+    how = "by" if found.word in CLEAR else "at"
+    return f"{word} *{name}* {how} {by} {margin} (renders {faster if times >= 1.0 else slower})"
 
 
 def listed(psnrs: Sequence[float]) -> str:

@@ -42,7 +42,7 @@ def test_the_gain_is_that_over_each_other_row_of_the_same_host() -> None:
     )
     told = "**In the same time,** with a learned occupancy, "
     alone = (
-        "leco-occupancy is beside *dense* by -1.0 dB, one seed: no verdict (renders 2.0 times as "
+        "leco-occupancy is beside *dense* at -1.0 dB, one seed: no verdict (renders 2.0 times as "
         "fast)."
     )
     assert parts.in_the_same_time(chart) == f"{told}{alone}"
