@@ -59,7 +59,7 @@ def test_the_gain_is_that_over_each_other_row_of_the_same_host() -> None:
     ]
     assert parts.in_the_same_time(chart | {"runs": [*runs[:3], *guided, *own]}) == (
         f"{told}leco-nerfacto is behind *dense* by 1.0 ± "
-        "0.2 dB (renders 2.0 times as fast) and level with *long-steps* by -0.1 ± 0.2 dB (renders "
+        "0.2 dB (renders 2.0 times as fast) and level with *long-steps* at -0.1 ± 0.2 dB (renders "
         "2.0 times as fast) and ahead of *own* by 5.0 ± 0.2 dB (renders 2.0 times as fast). "
         f"{alone}"
     )
