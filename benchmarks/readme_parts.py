@@ -142,7 +142,8 @@ def after_five_minutes() -> str:
             + ("; each seed is ahead of each of theirs" if clear else "")
         )
     given = " and ".join(dict.fromkeys(describe_seeds(results) for results in charts.values()))
-    return f"**After 300 s** Instant-NGP has ({given}) {'; '.join(parts)}." if parts else ""
+    begin = f"**After 300 s** ({given}) Instant-NGP with a learned occupancy has"
+    return f"{begin} {'; '.join(parts)}." if parts else ""
 
 
 def without_gifts(results: Mapping[str, Any]) -> str:
