@@ -65,6 +65,28 @@ def test_the_gain_is_that_over_each_other_row_of_the_same_host() -> None:
     )
 
 
+@pytest.mark.parametrize(("rivals", "clear"), [((20.0, 22.0), True), ((20.0, 24.5), False)])
+def test_more_time_is_told_scene_by_scene(
+    rivals: tuple[float, float], clear: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs = [
+        run(name, seed, psnr=psnr, sampler=sampler)
+        for name, sampler, psnrs in (
+            ("Instant-NGP + own", "own", rivals),
+            ("Instant-NGP + learned", "learned-occupancy", (24.0, 25.0)),
+        )
+        for seed, psnr in enumerate(psnrs)
+    ]
+    monkeypatch.setattr(parts, "titles", lambda: {"a": "No", "city-ngp-300": "Some chart"})
+    monkeypatch.setattr(parts, "stored", lambda name: results(*runs))
+    text = parts.after_five_minutes()
+    assert text.startswith("**After 300 s** (2 seeds) Instant-NGP with a learned occupancy has on ")
+    assert "`city` 24.5 dB ([figures](measurements.md#some-chart)), " in text and "*own*" in text
+    assert text.endswith("; each seed is ahead of each of theirs.") == clear
+    monkeypatch.setattr(parts, "titles", lambda: {"a": "No"})
+    assert parts.after_five_minutes() == ""
+
+
 def test_the_gain_says_how_many_runs_failed() -> None:
     failed = [{"name": "LeCO + own", "seed": 1, "reason": "no memory"}]
     ours = [run("LeCO + learned-occupancy", seed, gate_queries_per_ray=1.0) for seed in (0, 1)]
