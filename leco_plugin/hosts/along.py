@@ -21,7 +21,7 @@ from torch import Tensor
 from leco_plugin.evaluation.clock import seconds_now
 from leco_plugin.hosts.guide import Guide
 from leco_plugin.hosts.host_watch import squared_errors
-from leco_plugin.hosts.stand_ins import is_packed
+from leco_plugin.hosts.stand_ins import DEFAULTS, is_packed
 from leco_plugin.learning.calibration import (
     ERRORS,
     LOSSES,
@@ -224,8 +224,8 @@ class Along:
         guide, occupancy, bounds = self.guide, self.guide.the_occupancy(), self._bounds
 
         def hear(rays_o: Tensor, rays_d: Tensor, options: dict[str, Any]) -> Any:
-            step, cone = options.get("render_step_size", 1e-3), options.get("cone_angle", 0.0)
-            self.march = {"step_size": step, "cone_angle": cone}
+            asked = DEFAULTS | options
+            self.march = {"step_size": asked["render_step_size"], "cone_angle": asked["cone_angle"]}
             limits = {"early_stop_eps": 0.0, "alpha_thre": 0.0}
             samples = bounds.sampling(rays_o, rays_d, **{**options, **limits})
             one = _heard_of(occupancy, samples, rays_o, rays_d, options)

@@ -63,7 +63,8 @@ class _StandIn(nn.Module):
 
 _SAMPLING = inspect.signature(Estimator.sampling)
 _RAYS = ("self", "rays_o", "rays_d")
-_DEFAULTS = {name: parameter.default for name, parameter in _SAMPLING.parameters.items()}
+DEFAULTS = {name: parameter.default for name, parameter in _SAMPLING.parameters.items()}
+"""Of a host's sampling, where it does not say."""
 
 
 def _ending_in_a_backdrop(
@@ -81,7 +82,7 @@ def _ending_in_a_backdrop(
     have no place for the sky. It begins where a ray leaves the occupancy's walls [6], or, of one
     that misses them, at its end; a ray that a crop ends, or that is cut off [R], has none.
     """
-    options = _DEFAULTS | options
+    options = DEFAULTS | options
     ends = rays_o.new_full((len(rays_o),), float(options["far_plane"]))
     ends = ends if options["t_max"] is None else ends.minimum(options["t_max"])
     enters, leaves = intersect_box(rays_o, rays_d, walls)
