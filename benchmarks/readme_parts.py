@@ -49,7 +49,7 @@ STANDS = {
 def readme(text: str) -> str:
     """The README with its tables renewed."""
     text = between(text, DEMO, demo_sentence(json.loads((RESULTS / "demo.json").read_text())))
-    later = filter(None, [after_half_an_hour(), of_the_papers_host()])
+    later = filter(None, [f"{in_five_minutes()}{after_half_an_hour()}", of_the_papers_host()])
     text = with_walk(text, ("lines",))
     return between(text, GAIN, gain(without_gifts(stored(GIFTS_CHART)), *later))
 
@@ -127,10 +127,27 @@ def half_an_hour() -> str:
     )
 
 
+def _of_five_minutes() -> dict[str, Mapping[str, Any]]:
+    return {name: stored(name) for name in titles() if name.endswith(FIVE_MINUTES)}
+
+
+def in_five_minutes() -> str:
+    """What Instant-NGP has after 300 s, and its best other row, scene by scene; nothing where no
+    such chart is stored."""
+    parts = []
+    for name, results in _of_five_minutes().items():
+        ours, best = sorted(lines_of(results), key=lambda line: (not line.learned, -line.psnr))[:2]
+        stands = STANDS.get(compare(ours.psnrs, best.psnrs).word or "", "beside")
+        rival = best.name.removeprefix("Instant-NGP").lstrip(" +,")
+        scene = f"{ours.psnr:.1f} dB on `{results['scene']['name']}`{star(name)}"
+        parts.append(f"{scene}, {stands} *{rival}* ({best.psnr:.1f}; {describe_seeds(results)})")
+    return f"**After 300 s** Instant-NGP has {' and '.join(parts)}. " if parts else ""
+
+
 def after_five_minutes() -> str:
     """How Instant-NGP stands beside its other rows after 300 s, scene by scene; nothing where no
     such chart is stored."""
-    charts = {name: stored(name) for name in titles() if name.endswith(FIVE_MINUTES)}
+    charts = _of_five_minutes()
     parts = []
     for name, results in charts.items():
         ours, *rivals = sorted(lines_of(results), key=lambda line: (not line.learned, -line.psnr))

@@ -83,8 +83,11 @@ def test_more_time_is_told_scene_by_scene(
     assert text.startswith("**After 300 s** (2 seeds) Instant-NGP with a learned occupancy has on ")
     assert "`city` 24.5 dB ([figures](measurements.md#some-chart)), " in text and "*own*" in text
     assert text.endswith("; each seed is ahead of each of theirs.") == clear
+    short = "**After 300 s** Instant-NGP has 24.5 dB on `city`, "
+    assert parts.in_five_minutes().startswith(short)
+    assert parts.in_five_minutes().endswith(f" *own* ({sum(rivals) / 2:.1f}; 2 seeds). ")
     monkeypatch.setattr(parts, "titles", lambda: {"a": "No"})
-    assert parts.after_five_minutes() == ""
+    assert parts.after_five_minutes() == parts.in_five_minutes() == ""
 
 
 def test_the_gain_says_how_many_runs_failed() -> None:
@@ -111,6 +114,7 @@ def test_what_is_around_the_tables_is_left_as_it_is(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(parts, "gain_table", lambda chart: "table")
     monkeypatch.setattr(parts, "in_the_same_time", lambda chart, most=None: "gain")
     monkeypatch.setattr(parts, "on_a_city", lambda: "city")
+    monkeypatch.setattr(parts, "in_five_minutes", lambda: "")
     monkeypatch.setattr(parts, "without_gifts", lambda chart: "alone")
     monkeypatch.setattr(parts, "after_half_an_hour", lambda: "late")
     monkeypatch.setattr(parts, "of_the_papers_host", lambda: "")
