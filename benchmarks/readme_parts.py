@@ -82,8 +82,7 @@ def on_a_city() -> str:
     """How hosts of the gain stand beside their best other row on another scene."""
     parts = []
     for host, name in CITY_CHARTS.items():
-        lines = lines_of(stored(name))
-        ours, rival = sorted(lines, key=lambda line: (not line.learned, -line.psnr))[:2]
+        ours, rival = _ranked(stored(name))[:2]
         parts.append(f"{host} is {_beside(ours, rival, host)}{star(name)}")
     return f"On a city of 4 x 4 blocks {'. '.join(parts)}."
 
@@ -127,6 +126,16 @@ def half_an_hour() -> str:
     )
 
 
+def _ranked(results: Mapping[str, Any]) -> list[Line]:
+    """The rows of a chart: that with a learned occupancy, then the best first."""
+    return sorted(lines_of(results), key=lambda line: (not line.learned, -line.psnr))
+
+
+def _of_host(line: Line, host: str) -> str:
+    """What a row of a host is called beside it."""
+    return f"*{line.name.removeprefix(host).lstrip(' +,')}*"
+
+
 def _of_five_minutes() -> dict[str, Mapping[str, Any]]:
     return {name: stored(name) for name in titles() if name.endswith(FIVE_MINUTES)}
 
@@ -136,11 +145,12 @@ def in_five_minutes() -> str:
     such chart is stored."""
     parts = []
     for name, results in _of_five_minutes().items():
-        ours, best = sorted(lines_of(results), key=lambda line: (not line.learned, -line.psnr))[:2]
+        ours, best = _ranked(results)[:2]
         stands = STANDS.get(compare(ours.psnrs, best.psnrs).word or "", "beside")
-        rival = best.name.removeprefix("Instant-NGP").lstrip(" +,")
         scene = f"{ours.psnr:.1f} dB on `{results['scene']['name']}`{star(name)}"
-        parts.append(f"{scene}, {stands} *{rival}* ({best.psnr:.1f}; {describe_seeds(results)})")
+        parts.append(
+            f"{scene}, {stands} {_of_host(best, 'Instant-NGP')} ({best.psnr:.1f}; {describe_seeds(results)})"
+        )
     return f"**After 300 s** Instant-NGP has {' and '.join(parts)}. " if parts else ""
 
 
@@ -150,7 +160,7 @@ def after_five_minutes() -> str:
     charts = _of_five_minutes()
     parts = []
     for name, results in charts.items():
-        ours, *rivals = sorted(lines_of(results), key=lambda line: (not line.learned, -line.psnr))
+        ours, *rivals = _ranked(results)
         beside = " and ".join(_beside(ours, rival, "Instant-NGP") for rival in rivals)
         clear = min(ours.psnrs) > max(psnr for rival in rivals for psnr in rival.psnrs)
         parts.append(
@@ -310,7 +320,6 @@ def gains(lines: Sequence[Line], most: int | None = None) -> str:
 
 def _beside(ours: Line, rival: Line, host: str) -> str:
     """What ours gains over another row of its host."""
-    name = rival.name.removeprefix(host).lstrip(" +,")
     times = _median(rival, "render_seconds_per_image") / _median(ours, "render_seconds_per_image")
     found = compare(ours.psnrs, rival.psnrs)
     word = STANDS.get(found.word, "beside")
@@ -318,7 +327,8 @@ def _beside(ours: Line, rival: Line, host: str) -> str:
     margin = f"± {found.margin:.1f} dB" if found.margin is not None else f"dB, {found.by}"
     faster, slower = f"{times:.1f} times as fast", f"in {1.0 / times:.1f} times the time"
     how = "by" if found.word in CLEAR else "at"
-    return f"{word} *{name}* {how} {by} {margin} (renders {faster if times >= 1.0 else slower})"
+    renders = faster if times >= 1.0 else slower
+    return f"{word} {_of_host(rival, host)} {how} {by} {margin} (renders {renders})"
 
 
 def listed(psnrs: Sequence[float]) -> str:
