@@ -148,9 +148,8 @@ def in_five_minutes() -> str:
         ours, best = _ranked(results)[:2]
         stands = STANDS.get(compare(ours.psnrs, best.psnrs).word or "", "beside")
         scene = f"{ours.psnr:.1f} dB on `{results['scene']['name']}`{star(name)}"
-        parts.append(
-            f"{scene}, {stands} {_of_host(best, 'Instant-NGP')} ({best.psnr:.1f}; {describe_seeds(results)})"
-        )
+        rival = f"{_of_host(best, 'Instant-NGP')} ({best.psnr:.1f}; {describe_seeds(results)})"
+        parts.append(f"{scene}, {stands} {rival}")
     return f"**After 300 s** Instant-NGP has {' and '.join(parts)}. " if parts else ""
 
 
