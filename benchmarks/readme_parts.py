@@ -97,8 +97,7 @@ def of_the_papers_host() -> str:
         ours, *others = lines_of(results)
         rest: dict[str, list[str]] = {}
         for line in sorted(others, key=lambda line: -line.psnr):
-            stands = STANDS.get(compare(ours.psnrs, line.psnrs).word or "", "beside")
-            rest.setdefault(stands, []).append(f"*{line.name}* ({line.psnr:.1f})")
+            rest.setdefault(_stands(ours, line), []).append(f"*{line.name}* ({line.psnr:.1f})")
         beside = "; ".join(f"{stands} {' and '.join(names)}" for stands, names in rest.items())
         said.append(
             f"After {results['protocol']['seconds']:g} s on `{results['scene']['name']}` "
@@ -131,6 +130,11 @@ def _ranked(results: Mapping[str, Any]) -> list[Line]:
     return sorted(lines_of(results), key=lambda line: (not line.learned, -line.psnr))
 
 
+def _stands(ours: Line, other: Line) -> str:
+    """Words before the name of another row, for how ours stands beside it."""
+    return STANDS.get(compare(ours.psnrs, other.psnrs).word or "", "beside")
+
+
 def _of_host(line: Line, host: str) -> str:
     """What a row of a host is called beside it."""
     return f"*{line.name.removeprefix(host).lstrip(' +,')}*"
@@ -146,10 +150,9 @@ def in_five_minutes() -> str:
     parts = []
     for name, results in _of_five_minutes().items():
         ours, best = _ranked(results)[:2]
-        stands = STANDS.get(compare(ours.psnrs, best.psnrs).word or "", "beside")
         scene = f"{ours.psnr:.1f} dB on `{results['scene']['name']}`{star(name)}"
         rival = f"{_of_host(best, 'Instant-NGP')} ({best.psnr:.1f}; {describe_seeds(results)})"
-        parts.append(f"{scene}, {stands} {rival}")
+        parts.append(f"{scene}, {_stands(ours, best)} {rival}")
     return f"**After 300 s** Instant-NGP has {' and '.join(parts)}. " if parts else ""
 
 
@@ -321,13 +324,12 @@ def _beside(ours: Line, rival: Line, host: str) -> str:
     """What ours gains over another row of its host."""
     times = _median(rival, "render_seconds_per_image") / _median(ours, "render_seconds_per_image")
     found = compare(ours.psnrs, rival.psnrs)
-    word = STANDS.get(found.word, "beside")
     by = f"{abs(found.difference) if found.word in CLEAR else found.difference:.1f}"
     margin = f"± {found.margin:.1f} dB" if found.margin is not None else f"dB, {found.by}"
     faster, slower = f"{times:.1f} times as fast", f"in {1.0 / times:.1f} times the time"
     how = "by" if found.word in CLEAR else "at"
     renders = faster if times >= 1.0 else slower
-    return f"{word} {_of_host(rival, host)} {how} {by} {margin} (renders {renders})"
+    return f"{_stands(ours, rival)} {_of_host(rival, host)} {how} {by} {margin} (renders {renders})"
 
 
 def listed(psnrs: Sequence[float]) -> str:
