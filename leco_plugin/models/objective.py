@@ -105,10 +105,9 @@ def field_losses(
     """
     losses = {"rgb_loss": color_loss(shaded.rgb, truth)}
     near, far = span
-    backdrops = shaded.weights, backdrop_of(intervals, rays), intervals.ray_indices
     if weights.transparency > 0.0 and opacities is not None:
         losses["transparency_loss"] = weights.transparency * backdrop_loss(
-            *backdrops, 1.0 - opacities, (opacities < 1.0).to(opacities)
+            *_backdrops(shaded, intervals, rays), 1.0 - opacities, (opacities < 1.0).to(opacities)
         )
     distortion = weights.distortion * ramped * (1.0 if learning else weights.distortion_after)
     if distortion > 0.0:
@@ -123,7 +122,7 @@ def field_losses(
     if ground > 0.0:
         shows = (1.0 - dark) * (1.0 if opacities is None else opacities >= 1.0)
         losses["ground_loss"] = ground * backdrop_loss(
-            *backdrops, torch.zeros_like(shows), shows * grounded
+            *_backdrops(shaded, intervals, rays), torch.zeros_like(shows), shows * grounded
         )
     if weights.termination > 0.0 and distances is not None:
         losses["termination_loss"] = weights.termination * termination_loss(
@@ -133,6 +132,12 @@ def field_losses(
         nearness = (far - shaded.depth) / (far - near) * torch.where(unbounded, 1.0, dark)
         losses["nearness_loss"] = weights.nearness * ramped * nearness.mean()
     return losses
+
+
+def _backdrops(shaded: Shaded, intervals: Intervals, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
+    """Rendering weights [M], which of them are backdrops', and their rays; asked for by the losses
+    that need them, which guided steps of opaque photographs do not have."""
+    return shaded.weights, backdrop_of(intervals, rays), intervals.ray_indices
 
 
 def gate_losses(
