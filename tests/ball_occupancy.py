@@ -24,6 +24,7 @@ ENCODINGS = {
     "hash": EncodingConfig("hash", levels=3, log2_table=13, coarsest=8, finest=32),
     "vm": EncodingConfig("vm", components=4, plane_cells=32),
     "k-planes": EncodingConfig("k-planes", levels=3, coarsest=8, plane_cells=32),
+    "grid": EncodingConfig("grid", plane_cells=32),
 }
 
 

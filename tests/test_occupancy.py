@@ -28,6 +28,7 @@ GATES = {
     "k-planes": GateConfig(
         EncodingConfig("k-planes", levels=2, coarsest=2, plane_cells=3), width=8, layers=1
     ),
+    "grid": GateConfig(EncodingConfig("grid", plane_cells=3), width=8, layers=1),
 }
 
 
@@ -285,6 +286,7 @@ def test_a_header_that_claims_another_gate_is_refused(kind: str, tmp_path: Path)
         "hash": {"levels", "features", "log2_table"},
         "vm": {"components", "plane_cells"},
         "k-planes": {"levels", "features", "coarsest", "plane_cells"},
+        "grid": {"features", "plane_cells"},
     }[kind]
     claims = [{"kind": other} for other in GATES if other != kind]
     claims += [{name: size} for name in used for size in (1, 7, LARGEST_SIZES[name])]

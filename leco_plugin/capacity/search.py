@@ -132,6 +132,7 @@ def name_of(config: GateConfig) -> str:
         "hash": f"hash {encoding.levels} x 2^{encoding.log2_table}",
         "vm": f"VM {encoding.components} x {encoding.plane_cells}",
         "k-planes": f"K-planes {encoding.levels} x {encoding.features} x {encoding.plane_cells}",
+        "grid": f"grid {encoding.features} x {encoding.plane_cells}^3",
     }
     return f"{sizes[encoding.kind]}, {config.layers} x {config.width}"
 

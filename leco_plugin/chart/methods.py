@@ -77,6 +77,7 @@ SAMPLER_NAMES = {
     "learned-occupancy-hash": "hash-grid gate",
     "learned-occupancy-vm": "TensoRF gate",
     "learned-occupancy-k-planes": "K-planes gate",
+    "learned-occupancy-grid": "taught grid",
     DENSE: "every sample",
     LONG_STEPS: "long steps, no skipping",
     WITHOUT_GIFTS: "learned occupancy without gifts",

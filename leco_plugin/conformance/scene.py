@@ -19,6 +19,7 @@ from leco_plugin.models.encodings import (
     Encoding,
     EncodingConfig,
     FrequencyEncoding,
+    GridEncoding,
     HashEncoding,
     Kind,
     KPlanesEncoding,
@@ -228,6 +229,7 @@ SMALLEST: dict[Kind, EncodingConfig] = {
     "hash": EncodingConfig("hash", levels=1, features=1, log2_table=16, coarsest=2, finest=2),
     "vm": EncodingConfig("vm", components=2, plane_cells=1),
     "k-planes": EncodingConfig("k-planes", levels=1, features=2, coarsest=1, plane_cells=1),
+    "grid": EncodingConfig("grid", features=1, plane_cells=1),
 }
 """The least of each kind that holds a linear function."""
 
@@ -277,6 +279,9 @@ def write_linear(encoding: Encoding, normal: Tensor) -> Tensor:
         planes.fill_(1.0)
         planes[0, 0], planes[1, 1] = across, normal[2] * ends[:, None]
         weights[:2] = 1.0
+    elif isinstance(encoding, GridEncoding):
+        encoding.table[0, 0] = across + normal[2] * ends[:, None, None]
+        weights[0] = 1.0
     return weights
 
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from leco_plugin.models.compute.native import hash_gradients, hash_sums, suits
 
-Kind = Literal["frequency", "hash", "vm", "k-planes"]
+Kind = Literal["frequency", "hash", "vm", "k-planes", "grid"]
 
 
 @dataclass(frozen=True)
@@ -20,13 +20,14 @@ class EncodingConfig:
 
     kind: Kind = "frequency"
     """Sines and cosines (NeRF, eq. 4), a multi-resolution hash grid (Instant-NGP, section 3),
-    vector-matrix products (TensoRF, eq. 3), or products of planes (K-planes, eq. 1)."""
+    vector-matrix products (TensoRF, eq. 3), products of planes (K-planes, eq. 1), or a plain grid
+    (DVGO, eq. 4)."""
     octaves: int = 6
     """Frequency: number of octaves, the lowest with a period of twice the cube."""
     levels: int = 8
     """Hash, K-planes: number of resolutions."""
     features: int = 2
-    """Hash, K-planes: features per level."""
+    """Hash, K-planes, grid: features per level."""
     components: int = 8
     """VM: products of a plane and a line for each of the three pairs."""
     log2_table: int = 16
@@ -36,7 +37,8 @@ class EncodingConfig:
     finest: int = 1024
     """Hash: cells along the cube at the finest level."""
     plane_cells: int = 128
-    """VM, and the finest level of K-planes: cells along the cube; memory grows with the square."""
+    """VM, and the finest level of K-planes: cells along the cube; memory grows with the square.
+    Grid: the same; memory grows with the cube."""
 
 
 FRESH = {torch.float32: 4, torch.float16: 6, torch.bfloat16: 8}
@@ -290,7 +292,25 @@ class KPlanesEncoding(nn.Module):
             return torch.cat([level[0] * level[1] * level[2] for level in levels]).t()
 
 
-Encoding = FrequencyEncoding | HashEncoding | VectorMatrixEncoding | KPlanesEncoding
+class GridEncoding(nn.Module):
+    """Features at the corners of one grid of cells, interpolated in between (Sun et al. 2022, DVGO,
+    eq. 4): the occupancy grid that has a gate's teacher. Positions receive no gradient."""
+
+    def __init__(self, features: int, cells: int) -> None:
+        super().__init__()
+        self.out_dim = features
+        points = [cells + 1] * 3
+        self.table = nn.Parameter(torch.empty(1, features, *points).uniform_(-1e-4, 1e-4))
+
+    def forward(self, mapped: Tensor) -> Tensor:
+        """[N, 3] in [-1, 1] to [N, features] float32."""
+        with torch.autocast(mapped.device.type, enabled=False):
+            places = _inside(mapped, self.table).view(1, 1, 1, -1, 3)
+            found = nn.functional.grid_sample(self.table, places, align_corners=True)
+            return found.view(self.out_dim, -1).t()
+
+
+Encoding = FrequencyEncoding | HashEncoding | VectorMatrixEncoding | KPlanesEncoding | GridEncoding
 
 
 def build_encoding(config: EncodingConfig) -> Encoding:
@@ -302,4 +322,6 @@ def build_encoding(config: EncodingConfig) -> Encoding:
         return VectorMatrixEncoding(config.components, config.plane_cells)
     if config.kind == "k-planes":
         return KPlanesEncoding(levels, features, coarsest, config.plane_cells)
+    if config.kind == "grid":
+        return GridEncoding(features, config.plane_cells)
     return FrequencyEncoding(config.octaves)

@@ -74,7 +74,7 @@ LEARNED_OCCUPANCY = SamplerSpec(
 )
 
 
-LEARNED_OCCUPANCY_HASH, LEARNED_OCCUPANCY_VM, LEARNED_OCCUPANCY_K_PLANES = (
+LEARNED_OCCUPANCY_HASH, LEARNED_OCCUPANCY_VM, LEARNED_OCCUPANCY_K_PLANES, LEARNED_GRID = (
     replace(
         LEARNED_OCCUPANCY,
         description=f"learned occupancy whose gate is on {features}, for comparison",
@@ -84,6 +84,7 @@ LEARNED_OCCUPANCY_HASH, LEARNED_OCCUPANCY_VM, LEARNED_OCCUPANCY_K_PLANES = (
         ("hash-grid features", "hash"),
         ("TensoRF's vector-matrix features", "vm"),
         ("K-planes features", "k-planes"),
+        ("one grid of features", "grid"),
     )
 )
 OURS = {
@@ -94,6 +95,7 @@ OURS = {
     "learned-occupancy-hash": LEARNED_OCCUPANCY_HASH,
     "learned-occupancy-vm": LEARNED_OCCUPANCY_VM,
     "learned-occupancy-k-planes": LEARNED_OCCUPANCY_K_PLANES,
+    "learned-occupancy-grid": LEARNED_GRID,
 }
 
 

@@ -55,7 +55,7 @@ def test_the_baselines_keep_every_rule(name, seam):
     assert {verdict.seam for verdict in kept(sampler_cases(name))} == {seam}
 
 
-@pytest.mark.parametrize("features", ["hash", "vm", "k-planes"])
+@pytest.mark.parametrize("features", ["hash", "vm", "k-planes", "grid"])
 def test_a_gate_on_other_features_is_known_too(features):
     (case, _) = sampler_cases(f"learned-occupancy-{features}")
     kept([case], [rule for rule in SAMPLER_RULES if rule.name == "skips-only-what-it-may"])

@@ -81,7 +81,7 @@ def pipeline_of(kind: Kind, scene: Path) -> tuple[Any, Any]:
     return pipeline, pipeline.get_training_callbacks(attributes)
 
 
-@pytest.mark.parametrize("kind", ["hash", "vm", "k-planes"])
+@pytest.mark.parametrize("kind", ["hash", "vm", "k-planes", "grid"])
 def test_a_gate_on_any_features_is_learned_frozen_and_saved(
     kind, tiny_scene, tmp_path, monkeypatch
 ) -> None:

@@ -1,4 +1,4 @@
-"""Vector-matrix and K-planes features against slow twins written from the papers' definitions."""
+"""Vector-matrix, K-planes and grid features against slow twins written from their definitions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from leco_plugin.models.encodings import KPlanesEncoding, VectorMatrixEncoding
+from leco_plugin.models.encodings import GridEncoding, KPlanesEncoding, VectorMatrixEncoding
 
 AXES = {"XY": (0, 1, 2), "XZ": (0, 2, 1), "YZ": (1, 2, 0)}
 """Axes along the columns and the rows of each plane, and the one that it leaves out."""
@@ -50,14 +50,22 @@ def slow_k_planes(tables: list[Tensor], x: list[float]) -> Tensor:
     return torch.cat(levels)
 
 
-TWINS = {"vm": slow_vm, "k-planes": slow_k_planes}
+def slow_grid(tables: list[Tensor], x: list[float]) -> Tensor:
+    """DVGO, eq. 4: bilinear in each layer, then between the layers."""
+    (values,) = tables[0]
+    return between([bilinear(layer, x[0], x[1]) for layer in values.unbind(1)], x[2])
+
+
+TWINS = {"vm": slow_vm, "k-planes": slow_k_planes, "grid": slow_grid}
 kinds = pytest.mark.parametrize("kind", TWINS)
 
 
-def encoding_of(kind: str) -> VectorMatrixEncoding | KPlanesEncoding:
+def encoding_of(kind: str) -> VectorMatrixEncoding | KPlanesEncoding | GridEncoding:
     torch.manual_seed(0)
     if kind == "vm":
         return VectorMatrixEncoding(components=2, cells=5).double()
+    if kind == "grid":
+        return GridEncoding(features=2, cells=5).double()
     return KPlanesEncoding(levels=3, features=2, coarsest=2, finest=7).double()
 
 

@@ -212,7 +212,7 @@ def test_a_constant_gate_needs_no_bricks(constant):
     assert decided.float().mean() == constant
 
 
-@pytest.mark.parametrize("kind", ["hash", "vm", "k-planes"])
+@pytest.mark.parametrize("kind", ["hash", "vm", "k-planes", "grid"])
 def test_a_gate_on_any_features_can_be_held(kind):
     occupancy = ball(kind)
     cache = build_cache(occupancy, budget=BUDGET, check_points=1 << 17, tolerance=2e-4)
@@ -226,7 +226,7 @@ def test_a_gate_on_any_features_can_be_held(kind):
     assert float(differing.float().mean()) <= 2e-4
 
 
-@pytest.mark.parametrize("kind", ["hash", "vm", "k-planes"])
+@pytest.mark.parametrize("kind", ["hash", "vm", "k-planes", "grid"])
 def test_an_untaught_gate_on_any_features_is_asked_without_a_cache(kind, caplog):
     torch.manual_seed(0)
     gate = Gate(GateConfig(EncodingConfig(kind, plane_cells=64), width=8, layers=1))

@@ -28,7 +28,7 @@ from leco_plugin.samplers.registry import (
     samplers,
 )
 
-KINDS = ["hash", "vm", "k-planes"]
+KINDS = ["hash", "vm", "k-planes", "grid"]
 BOX = torch.tensor([-1.0] * 3 + [1.0] * 3)
 FOREIGN = SamplerSpec("another package's", estimator=lambda aabb, occupancy: torch.nn.Identity())
 
