@@ -22,8 +22,9 @@ PADDED = 16
 Parts = Sequence[Tensor | None]
 
 
-def _padded(matrix: Tensor) -> Tensor:
-    """With zeros in new rows and columns."""
+def _padded(part: Tensor) -> Tensor:
+    """A matrix, or a vector as one of a single row, with zeros in new rows and columns."""
+    matrix = torch.atleast_2d(part)
     rows, columns = (-size % PADDED for size in matrix.shape)
     return torch.nn.functional.pad(matrix, (0, columns, 0, rows))
 
@@ -36,55 +37,38 @@ def _layers(parts: Parts) -> list[Tensor | None]:
             made += [None] * 3
             continue
         whole = _padded(weight)
-        made += [whole, whole.t().contiguous(), _padded(bias[None])[0].contiguous()]
+        made += [whole, whole.t().contiguous(), _padded(bias)[0]]
     return made
-
-
-class _Sums:
-    """Room for the gradients of weights, biases and other vectors, of each thread by itself."""
-
-    def __init__(self, parts: Parts) -> None:
-        self.parts = parts
-        self.of_threads: dict[int, list[Tensor | None]] = {}
-
-    def of(self, begin: int) -> list[Tensor | None]:
-        """Zeros, padded, for the thread that begins there."""
-        found: list[Tensor | None] = []
-        for part in self.parts:
-            padded = None if part is None else _padded(part if part.dim() > 1 else part[None])
-            found.append(None if padded is None else torch.zeros_like(padded))
-        self.of_threads[begin] = found
-        return found
-
-    def total(self) -> list[Tensor | None]:
-        """Shaped as the parts, in an order that does not depend on which thread was first."""
-        sums: list[Tensor | None] = []
-        for number, part in enumerate(self.parts):
-            if part is None:
-                sums.append(None)
-                continue
-            ordered = [found[number] for _, found in sorted(self.of_threads.items())]
-            whole = torch.stack(ordered).sum(dim=0)  # type: ignore[arg-type]
-            rows = whole[0, : len(part)] if part.dim() == 1 else whole[: len(part), : part.shape[1]]
-            sums.append(rows.contiguous())
-        return sums
 
 
 def _run(
     name: str, parts: Parts, call: Callable[[Any, list[Tensor | None], int, int], int], count: int
 ) -> list[Tensor | None]:
     """Calls a routine on some of its points at a time; returns the gradients of weights and biases,
-    None for a part that is None."""
-    routine, sums = native.routine_of(name), _Sums(parts)
+    None for a part that is None. Each thread adds to sums of its own, by where it begins."""
+    routine = native.routine_of(name)
+    sums: dict[int, list[Tensor | None]] = {}
     failed: list[int] = []
 
     def work(begin: int, end: int) -> None:
-        failed.append(call(routine, sums.of(begin), begin, end))
+        own = [None if part is None else torch.zeros_like(_padded(part)) for part in parts]
+        sums[begin] = own
+        failed.append(call(routine, own, begin, end))
 
     native.in_threads(work, count, count // native.FEWEST)
     if any(failed):
         raise MemoryError("no memory for the gradients of a batch")
-    return sums.total()
+    in_order = [own for _, own in sorted(sums.items())]  # whichever thread was first
+    return [_total(part, found) for part, *found in zip(parts, *in_order)]
+
+
+def _total(part: Tensor | None, found: Sequence[Tensor | None]) -> Tensor | None:
+    """The sum of what threads have found, shaped as the part."""
+    if part is None:
+        return None
+    whole = torch.stack(found).sum(dim=0)  # type: ignore[arg-type]
+    rows, columns = torch.atleast_2d(part).shape
+    return whole[:rows, :columns].contiguous().view_as(part)
 
 
 class GateLogits(torch.autograd.Function):
@@ -103,8 +87,7 @@ class GateLogits(torch.autograd.Function):
     def backward(ctx: Any, given: Tensor) -> tuple[Tensor | None, ...]:
         mapped, scales, *parts = ctx.saved_tensors
         layers, width, given = len(parts) // 2 - 2, len(parts[0]), given.contiguous()
-        norm = parts[-4:-2]
-        of_norm = [_padded(each[None])[0].contiguous() for each in norm]
+        of_norm = [_padded(each)[0] for each in parts[-4:-2]]
         whole = [*_layers(parts[:-4]), *of_norm, *_layers(parts[-2:])]
         read = *native.pointers_to(mapped, scales), native.addresses_of(whole)
         strides = ctypes.c_int64(mapped.stride(1)), ctypes.c_int64(mapped.stride(0))
