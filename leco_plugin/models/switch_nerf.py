@@ -31,13 +31,9 @@ from leco_plugin.models.switch.field import (
     SwitchField,
     SwitchNerfModelConfig,
 )
-from leco_plugin.models.switch.rendering import (
-    coarse_and_fine,
-    keep_candidates,
-    switch_losses,
-    switch_statistics,
-)
+from leco_plugin.models.switch.rendering import coarse_and_fine, switch_losses, switch_statistics
 from leco_plugin.occupancy import gate_precision
+from leco_plugin.samplers.base import densities_of_samples
 from leco_plugin.samplers.grid import OccupancyGridEstimator
 from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.scenes.learning_data import LearningData
@@ -196,18 +192,21 @@ class SwitchNerfModel(Model):
     def _shade(self, rays: Rays) -> tuple[Intervals, Shaded]:
         """Samples along rays in whichever way, shaded."""
         region, step, cone_angle = self.region, float(self.step), float(self.cone)
-        config, sizes = self.config, self.config.sizes
         if self.occupancy_grid is not None:
-            packed = keep_candidates(
-                self.occupancy_grid,
-                rays,
-                step,
-                cone_angle,
-                self.training,
-                self.density_fn if self.training else None,
-                config.early_stop_eps,
+            estimator: Any = self.occupancy_grid
+            densities = densities_of_samples(self.density_fn, rays.origins, rays.directions)
+            packed = estimator.sampling(
+                rays.origins,
+                rays.directions,
+                sigma_fn=densities if self.training else None,
+                t_min=rays.t_mins,
+                t_max=rays.t_maxs,
+                render_step_size=step,
+                early_stop_eps=self.config.early_stop_eps,
+                stratified=self.training,
+                cone_angle=cone_angle,
             )
-            intervals = with_backdrop(packed, rays, step, cone_angle)
+            intervals = with_backdrop(Intervals(*packed), rays, step, cone_angle)
             answers = self._ask(mapped_middles(region.space, rays, intervals))
         else:
             stops = backdrop_starts(rays, step, cone_angle).maximum(rays.t_mins)
@@ -216,7 +215,7 @@ class SwitchNerfModel(Model):
                 region.space,
                 rays,
                 stops,
-                (sizes.coarse, sizes.fine),
+                (self.config.sizes.coarse, self.config.sizes.fine),
                 growing=region.space.kind == "contraction",
                 jittered=self.training,
             )

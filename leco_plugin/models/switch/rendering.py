@@ -3,21 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from leco_plugin.models.compute.dispatch import permute_rows
 from leco_plugin.models.losses import balance_loss, expert_shares
-from leco_plugin.models.rendering import (
-    Answers,
-    Intervals,
-    Rays,
-    Shaded,
-    mapped_middles,
-)
-from leco_plugin.samplers.base import densities_of_samples
+from leco_plugin.models.rendering import Answers, Intervals, Rays, Shaded, mapped_middles
 from leco_plugin.samplers.packed import render_weight_from_density
 from leco_plugin.space import Space
 
@@ -139,39 +131,6 @@ def _in_order(first: Answers, second: Answers, order: Tensor, num_first: int) ->
         permute_rows(features, rows, back),
         permute_rows(logits, rows, back),
         routes.index_select(0, rows),
-    )
-
-
-def keep_candidates(
-    estimator: Any,
-    rays: Rays,
-    step_size: float,
-    cone_angle: float,
-    jittered: bool,
-    density_fn: Callable[[Tensor], Tensor] | None,
-    early_stop_eps: float,
-) -> Intervals:
-    """The candidates along rays that an estimator with nerfacc's `sampling` keeps.
-
-    Args:
-        density_fn: scene positions [N, 3] to densities per scene unit [N, 1]; None asks none.
-        early_stop_eps: transmittance below which a sample is left out.
-    """
-    sigma_fn = None
-    if density_fn is not None:
-        sigma_fn = densities_of_samples(density_fn, rays.origins, rays.directions)
-    return Intervals(
-        *estimator.sampling(
-            rays.origins,
-            rays.directions,
-            sigma_fn=sigma_fn,
-            t_min=rays.t_mins,
-            t_max=rays.t_maxs,
-            render_step_size=step_size,
-            early_stop_eps=early_stop_eps,
-            stratified=jittered,
-            cone_angle=cone_angle,
-        )
     )
 
 

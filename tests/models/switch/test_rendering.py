@@ -7,9 +7,16 @@ import torch
 from torch import Tensor
 
 from leco_plugin.models.field import ColorHead
-from leco_plugin.models.rendering import Answers, Rays, backdrop_of, render, with_backdrop
-from leco_plugin.models.switch.rendering import coarse_and_fine, keep_candidates
-from leco_plugin.samplers.base import DenseEstimator
+from leco_plugin.models.rendering import (
+    Answers,
+    Intervals,
+    Rays,
+    backdrop_of,
+    render,
+    with_backdrop,
+)
+from leco_plugin.models.switch.rendering import coarse_and_fine
+from leco_plugin.samplers.base import DenseEstimator, SampleFn, densities_of_samples
 from leco_plugin.space import Space
 
 SPACE = Space("box", half_extent=10.0)
@@ -28,6 +35,13 @@ def some_rays(count: int = 6) -> Rays:
     origins[0, 1:] = 0.0
     directions = torch.tensor([[1.0, 0.0, 0.0]]).expand(count, 3)
     return Rays(origins, directions, torch.full((count,), 1.0), torch.full((count,), 8.0), None)
+
+
+def sampled(rays: Rays, step: float, sigma_fn: SampleFn | None = None) -> Intervals:
+    """All candidates of rays, but those that lie behind an opaque place."""
+    limits = {"t_min": rays.t_mins, "t_max": rays.t_maxs, "render_step_size": step}
+    found = DenseEstimator().sampling(rays.origins, rays.directions, sigma_fn, **limits)
+    return Intervals(*found)
 
 
 @pytest.mark.parametrize("jittered", [False, True])
@@ -81,8 +95,7 @@ def test_the_backdrop_gives_its_colour_and_is_nothing_met() -> None:
 
 def test_packed_samples_of_all_candidates_render_what_coarse_and_fine_do() -> None:
     color, rays = ColorHead(3, 8, 1, 0, 1), some_rays()
-    packed = keep_candidates(DenseEstimator(), rays, 0.02, 0.0, False, None, 1e-4)
-    intervals = with_backdrop(packed, rays, 0.02, 0.0)
+    intervals = with_backdrop(sampled(rays, 0.02), rays, 0.02, 0.0)
     places = rays.origins[intervals.ray_indices] + rays.directions[intervals.ray_indices] * (
         0.5 * (intervals.t_starts + intervals.t_ends)
     ).unsqueeze(-1)
@@ -101,8 +114,8 @@ def test_pruning_leaves_out_what_lies_behind_an_opaque_place() -> None:
     def density_fn(positions: Tensor) -> Tensor:
         return ball(positions / 10.0).sigmas[:, None] / 10.0
 
-    everything = keep_candidates(DenseEstimator(), rays, 0.05, 0.0, False, None, 1e-4)
-    seen = keep_candidates(DenseEstimator(), rays, 0.05, 0.0, False, density_fn, 1e-4)
+    densities = densities_of_samples(density_fn, rays.origins, rays.directions)
+    everything, seen = sampled(rays, 0.05), sampled(rays, 0.05, densities)
     assert 3.0 < float(seen.t_ends.max()) < 5.0 < float(everything.t_ends.max())
 
 
