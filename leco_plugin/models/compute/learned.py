@@ -72,31 +72,45 @@ def _total(part: Tensor | None, found: Sequence[Tensor | None]) -> Tensor | None
 
 
 class GateLogits(torch.autograd.Function):
-    """`native.gate_logits` of a gate that learns; positions receive no gradient."""
+    """Logits [N, 1 + n] of a gate on frequencies; positions receive no gradient.
+
+    Args of `apply`:
+        mapped: [N, 3] float32 in [-1, 1], in any strides.
+        scales: [octaves] float32, what positions are multiplied by.
+        fresh: each so many octaves, sines are computed anew rather than doubled.
+        epsilon: of the norm.
+        parts: weights and biases of the hidden layers, scale and shift of the norm, weights and
+            biases of the last layer.
+    """
 
     @staticmethod
     def forward(
         ctx: Any, mapped: Tensor, scales: Tensor, fresh: int, epsilon: float, *parts: Tensor
     ) -> Tensor:
         ctx.save_for_backward(mapped, scales, *parts)
-        ctx.fresh, ctx.epsilon = fresh, epsilon
-        return native.gate_logits(mapped, scales, fresh, parts, epsilon)
+        layers, width, outputs = len(parts) // 2 - 2, len(parts[0]), len(parts[-1])
+        strides = ctypes.c_int64(mapped.stride(1)), ctypes.c_int64(mapped.stride(0))
+        sizes = len(scales), fresh, layers, width, outputs, ctypes.c_float(epsilon)
+        ctx.after = *strides, *sizes
+        logits = mapped.new_empty(len(mapped), outputs)
+        whole = native.addresses_of(parts)
+        given = *native.pointers_to(mapped, scales), whole, *native.pointers_to(logits)
+        native.of_points("gate_logits", given, len(mapped), ctx.after)
+        return logits
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, given: Tensor) -> tuple[Tensor | None, ...]:
         mapped, scales, *parts = ctx.saved_tensors
-        layers, width, given = len(parts) // 2 - 2, len(parts[0]), given.contiguous()
+        given = given.contiguous()
         of_norm = [_padded(each)[0] for each in parts[-4:-2]]
         whole = [*_layers(parts[:-4]), *of_norm, *_layers(parts[-2:])]
         read = *native.pointers_to(mapped, scales), native.addresses_of(whole)
-        strides = ctypes.c_int64(mapped.stride(1)), ctypes.c_int64(mapped.stride(0))
-        sizes = len(scales), ctx.fresh, layers, width, given.shape[-1], ctypes.c_float(ctx.epsilon)
 
         def call(routine: Any, found: list[Tensor | None], begin: int, end: int) -> int:
-            part = ctypes.c_int64(begin), ctypes.c_int64(end), *strides
+            part = ctypes.c_int64(begin), ctypes.c_int64(end)
             places = *native.pointers_to(given), native.addresses_of(found)
-            made: int = routine(*read, *places, *part, *sizes)
+            made: int = routine(*read, *places, *part, *ctx.after)
             return made
 
         found = _run("gate_gradients", parts, call, len(mapped))
@@ -104,7 +118,16 @@ class GateLogits(torch.autograd.Function):
 
 
 class FieldDensities(torch.autograd.Function):
-    """`native.field_densities` of a field that learns."""
+    """Hidden features [N, width] and raw densities [N] of a field of experts.
+
+    Args of `apply`:
+        features: [N, inputs] float32 of the encoding.
+        routes: [N] int64, the expert of each point.
+        factors: [N] float32 of the hidden features.
+        layers: of an expert.
+        parts: weights and biases of the projection and of the density, then those of each expert's
+            layers; None for those of an expert that adds nothing.
+    """
 
     @staticmethod
     def forward(
@@ -114,8 +137,13 @@ class FieldDensities(torch.autograd.Function):
         order = routes.argsort()
         features, factors = features.contiguous(), factors.contiguous()
         ctx.save_for_backward(features, order, routes, factors, *parts)
-        ctx.layers = layers
-        return native.field_densities(features, routes, factors, parts, layers, order)
+        width = len(parts[1])
+        ctx.sizes = features.shape[1], width, layers
+        hidden, raw = features.new_empty(len(features), width), features.new_empty(len(features))
+        pointers = native.pointers_to(features, order, routes, factors)
+        given = *pointers, native.addresses_of(parts), *native.pointers_to(hidden, raw)
+        native.of_points("field_densities", given, len(features), ctx.sizes)
+        return hidden, raw
 
     @staticmethod
     @once_differentiable
@@ -127,14 +155,13 @@ class FieldDensities(torch.autograd.Function):
         given = of_hidden.contiguous(), of_raw.contiguous()
         rest = native.pointers_to(*given, of_features, of_factors)
         read = *points, native.addresses_of(kept), *rest
-        sizes = features.shape[-1], len(parts[1]), ctx.layers
 
         def call(routine: Any, found: list[Tensor | None], begin: int, end: int) -> int:
             part = ctypes.c_int64(begin), ctypes.c_int64(end)
-            made: int = routine(*read, native.addresses_of(found), *part, *sizes)
+            made: int = routine(*read, native.addresses_of(found), *part, *ctx.sizes)
             return made
 
-        asked, each = set(routes.unique().tolist()), 2 * ctx.layers
+        asked, each = set(routes.unique().tolist()), 2 * ctx.sizes[-1]
         for expert in range((len(parts) - 4) // each):
             if expert not in asked:  # no gradient, rather than one of zeros that Adam acts on
                 parts[4 + each * expert : 4 + each * (expert + 1)] = [None] * each

@@ -100,11 +100,11 @@ def hash_sums(positions: Tensor, resolutions: Tensor, table: Tensor, corners: in
     resolutions = resolutions.float().contiguous()
     pointers = pointers_to(positions, resolutions, table, out)
     sizes = (levels, log2_of(rows // levels), features, corners)
-    _of_points("hash_sums", pointers, len(positions), sizes)
+    of_points("hash_sums", pointers, len(positions), sizes)
     return out
 
 
-def _of_points(name: str, before: Sequence[Any], count: int, after: Sequence[Any]) -> None:
+def of_points(name: str, before: Sequence[Any], count: int, after: Sequence[Any]) -> None:
     """Calls a routine on parts of so many points; where a part begins and ends stands between its
     other arguments."""
     routine = routine_of(name)
@@ -138,56 +138,6 @@ def hash_gradients(
 
     in_threads(work, levels, len(positions) // FEWEST)
     return table
-
-
-def gate_logits(
-    mapped: Tensor, scales: Tensor, fresh: int, parts: Sequence[Tensor], epsilon: float
-) -> Tensor:
-    """Logits [N, 1 + n] of a gate on frequencies, without a graph.
-
-    Args:
-        mapped: [N, 3] float32 in [-1, 1], in any strides.
-        scales: [octaves] float32, what positions are multiplied by.
-        fresh: each so many octaves, sines are computed anew rather than doubled.
-        parts: weights and biases of the hidden layers, scale and shift of the norm, weights and
-            biases of the last layer.
-        epsilon: of the norm.
-    """
-    width, outputs = len(parts[0]), len(parts[-1])
-    layers = len(parts) // 2 - 2
-    logits = mapped.new_empty(len(mapped), outputs)
-    given = *pointers_to(mapped, scales), addresses_of(parts), *pointers_to(logits)
-    strides = ctypes.c_int64(mapped.stride(1)), ctypes.c_int64(mapped.stride(0))
-    sizes = (len(scales), fresh, layers, width, outputs, ctypes.c_float(epsilon))
-    _of_points("gate_logits", given, len(mapped), (*strides, *sizes))
-    return logits
-
-
-def field_densities(
-    features: Tensor,
-    routes: Tensor,
-    factors: Tensor,
-    parts: Sequence[Tensor | None],
-    layers: int,
-    order: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """Hidden features [N, width] and raw densities [N] of a field of experts, without a graph.
-
-    Args:
-        features: [N, inputs] float32 of the encoding; contiguous, as the next two are.
-        routes: [N] int64, the expert of each point.
-        factors: [N] float32 of the hidden features.
-        parts: weights and biases of the projection and of the density, then those of each expert's
-            layers; None for those of an expert that adds nothing.
-        layers: of an expert.
-        order: [N] int64, points in the order of their routes.
-    """
-    width = len(parts[1])  # type: ignore[arg-type]
-    hidden, raw = features.new_empty(len(features), width), features.new_empty(len(features))
-    pointers = pointers_to(features, order, routes, factors)
-    given = *pointers, addresses_of(parts), *pointers_to(hidden, raw)
-    _of_points("field_densities", given, len(features), (features.shape[1], width, layers))
-    return hidden, raw
 
 
 def call_along_rays(name: str, rooms: Tensor, *given: Values) -> list[slice]:
