@@ -89,7 +89,8 @@ def build_cache(
             within the smallest cells; ask it without a cache).
     """
     if check_points is None:
-        check_points = _points_to_check(budget, tolerance)
+        fewest = math.ceil(10.0 / max(tolerance, 1e-5))  # of three that differ, the bound is 8.5
+        check_points = min(max(budget, fewest), MOST_POINTS)
     device = occupancy.space.center.device
     if device.type == "mps":  # lacks some of what judging takes, none of what looking up takes
         cpu = copy.deepcopy(occupancy).to("cpu")  # type: ignore[attr-defined]
@@ -116,12 +117,6 @@ def build_cache(
         f"that fit {budget} bytes: {report.differing:.2g} of the decisions differ, "
         f"{tolerance:g} may"
     )
-
-
-def _points_to_check(budget: int, tolerance: float) -> int:
-    """The default of `check_points`. Smaller tables decide about fewer cells, and need fewer."""
-    fewest = math.ceil(10.0 / max(tolerance, 1e-5))  # of three that differ, the bound is 8.5
-    return min(max(budget, fewest), MOST_POINTS)
 
 
 def _finest_of_use(probe: Tensor) -> float:

@@ -103,9 +103,11 @@ def _pack(occupancy: Any) -> GateWeights:
     width, logits, columns = config.width, 1 + config.scene_experts, power_of_two(_columns(octaves))
     padded, padded_logits = power_of_two(width), power_of_two(logits)
     first, *others = (layer.weight.float().T for layer in gate.hidden)
+    coordinates, sines, cosines = first.split([3, 3 * octaves, 3 * octaves])
     last = (gate.head.weight.float() * gate.norm.weight.float()).T
     matrices = [
-        *(_pad(matrix, columns, padded) for matrix in _of_features(first, octaves)),
+        _pad(cosines, columns, padded),
+        _pad(torch.cat([sines, coordinates]), columns, padded),
         *(_pad(matrix, padded, padded) for matrix in others),
     ]
     last = _pad(last, padded, padded_logits)
@@ -142,12 +144,6 @@ def _pack(occupancy: Any) -> GateWeights:
 def _columns(octaves: int) -> int:
     """Sines and coordinates of a position; of cosines there are three fewer."""
     return 3 * octaves + 3
-
-
-def _of_features(first: Tensor, octaves: int) -> list[Tensor]:
-    """The first layer [features, width] in the parts in which the kernel has its features."""
-    coordinates, sines, cosines = first.split([3, 3 * octaves, 3 * octaves])
-    return [cosines, torch.cat([sines, coordinates])]
 
 
 def power_of_two(size: int) -> int:
