@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import torch
@@ -200,17 +201,12 @@ class Along:
         with self._listening(heard), torch.no_grad():
             for bundle in bundles:
                 self.host(bundle.to(self.host.device))
-        first = torch.tensor([0, *(one.rays for one in heard)]).cumsum(0).tolist()
-        intervals = zip(*(one.intervals for one in heard))
-        of_rays, *ends = ([*parts] for parts in intervals)
-        of_rays = [indices + number for indices, number in zip(of_rays, first)]
-        return Heard(
-            torch.cat([one.mapped for one in heard]),
-            Intervals(torch.cat(of_rays), *(torch.cat(parts) for parts in ends)),
-            torch.cat([one.weights for one in heard]),
-            torch.cat([one.kept for one in heard]),
-            first[-1],
-        )
+        mapped, intervals, weights, kept, rays = zip(*heard)
+        of_rays, *ends = zip(*intervals)
+        firsts = accumulate(rays, initial=0)
+        numbered = [numbers + first for numbers, first in zip(of_rays, firsts)]
+        together = Intervals(*map(torch.cat, (numbered, *ends)))
+        return Heard(torch.cat(mapped), together, torch.cat(weights), torch.cat(kept), sum(rays))
 
     @cached_property
     def _bounds(self) -> LearnedOccupancyEstimator:
@@ -227,16 +223,12 @@ class Along:
             asked = DEFAULTS | options
             self.march = {"step_size": asked["render_step_size"], "cone_angle": asked["cone_angle"]}
             limits = {"early_stop_eps": 0.0, "alpha_thre": 0.0}
-            samples = bounds.sampling(rays_o, rays_d, **{**options, **limits})
-            one = _heard_of(occupancy, samples, rays_o, rays_d, options)
+            samples = bounds.sampling(rays_o, rays_d, **options | limits)
+            one = _heard_of(occupancy, samples, rays_o, rays_d, asked["sigma_fn"])
             heard.append(one)
             of_rays, starts, ends = (part[one.kept] for part in samples)
             names = ("sigma_fn", "alpha_fn", "early_stop_eps", "alpha_thre")
-            return prune(
-                (of_rays, starts, ends),
-                len(rays_o),
-                **{n: options[n] for n in names if n in options},
-            )
+            return prune((of_rays, starts, ends), len(rays_o), *(asked[name] for name in names))
 
         was_training = self.host.training
         self.host.train()  # only then a host asks for densities
@@ -298,15 +290,14 @@ class Along:
 
 
 def _heard_of(
-    occupancy: Occupancy, samples: Any, rays_o: Tensor, rays_d: Tensor, options: dict[str, Any]
+    occupancy: Occupancy, samples: Any, rays_o: Tensor, rays_d: Tensor, density: Any
 ) -> Heard:
     """What a field says at candidates: it is asked where the occupancy keeps them."""
+    if density is None:
+        raise InputError(NO_DENSITIES)
     of_rays, starts, ends = samples
     middles = midpoints(samples, rays_o, rays_d)
     kept = occupancy.occupied(middles)
-    density = options.get("sigma_fn")
-    if density is None:
-        raise InputError(NO_DENSITIES)
     asked = [part[kept] for part in (starts, ends, of_rays)]
     weights = torch.zeros_like(starts)
     rays = len(rays_o)
