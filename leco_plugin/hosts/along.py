@@ -205,7 +205,7 @@ class Along:
         of_rays, *ends = zip(*intervals)
         firsts = accumulate(rays, initial=0)
         numbered = [numbers + first for numbers, first in zip(of_rays, firsts)]
-        together = Intervals(*map(torch.cat, (numbered, *ends)))
+        together = Intervals(torch.cat(numbered), *(torch.cat(parts) for parts in ends))
         return Heard(torch.cat(mapped), together, torch.cat(weights), torch.cat(kept), sum(rays))
 
     @cached_property

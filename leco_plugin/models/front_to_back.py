@@ -59,21 +59,11 @@ MANY_RAYS = 2048
 """In a batch from which on a CPU torch is no slower for looking; see `docs/decisions.md`."""
 
 
-def is_no_slower(num_rays: int, guided: bool, device: torch.device) -> bool:
-    """Whether shading a batch from the front in torch was measured to take no longer than shading
-    all; `guided` is where only what an occupancy keeps is shaded."""
-    return guided and device.type == "cpu" and num_rays >= MANY_RAYS
-
-
-def shade_where_faster(
-    scene: Scene, rays: Rays, intervals: Intervals, guided: bool
-) -> tuple[Shaded, Intervals] | None:
-    """`shade_front_to_back`, or None where that was not measured to take no longer."""
-    if suits_native(scene, rays, intervals):
-        return shade_natively(scene, rays, intervals)
-    if is_no_slower(len(rays.origins), guided, rays.origins.device):
-        return shade_in_torch(scene, rays, intervals)
-    return None
+def is_no_slower(scene: Scene, rays: Rays, intervals: Intervals, guided: bool) -> bool:
+    """Whether `shade_front_to_back` was measured to take no longer than shading all: in C, and in
+    torch for many rays on a CPU of which only what an occupancy keeps is shaded (`guided`)."""
+    many = rays.origins.device.type == "cpu" and len(rays.origins) >= MANY_RAYS
+    return (guided and many) or suits_native(scene, rays, intervals)
 
 
 @torch.no_grad()

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.models.field import HMoEField
-from leco_plugin.models.front_to_back import shade_front_to_back, shade_where_faster
+from leco_plugin.models.front_to_back import is_no_slower, shade_front_to_back
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.region import Region, marching_rule
 from leco_plugin.models.rendering import (
@@ -208,11 +208,10 @@ class Mixture(nn.Module):
         """
         given = self.scene(), rays, intervals
         with gate_precision(self.device.type, self.precision):
+            if front_to_back is None:
+                front_to_back = is_no_slower(*given, self.skips)
             if front_to_back:
                 return shade_front_to_back(*given)
-            found = shade_where_faster(*given, self.skips) if front_to_back is None else None
-        if found is not None:
-            return found
         return self.shade(rays, intervals), intervals
 
     @torch.no_grad()

@@ -254,12 +254,21 @@ def test_samples_of_some_rays_are_counted_out() -> None:
     assert found.tolist() == [3, 4, 20, 21, 22]
 
 
-def test_where_torch_was_not_measured_to_be_no_slower_it_shades_everything() -> None:
-    cpu = torch.device("cpu")
-    assert is_no_slower(MANY_RAYS, True, cpu)
-    assert not is_no_slower(MANY_RAYS - 1, True, cpu)
-    assert not is_no_slower(MANY_RAYS, False, cpu)
-    assert not is_no_slower(MANY_RAYS, True, torch.device("cuda"))
+def test_where_torch_was_not_measured_to_be_no_slower_it_shades_everything(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv(VARIABLE, "native")
+
+    def on(count: int, guided: bool, device: str = "cpu") -> bool:
+        nothing = Intervals(*torch.empty(3, 0, device=device))
+        at, toward = torch.empty(2, count, 3, device=device)
+        rays = Rays(at, toward, at[:, 0], at[:, 0], None)
+        return is_no_slower(scene_of(1.0), rays, nothing, guided)
+
+    assert on(MANY_RAYS, True)
+    assert not on(MANY_RAYS - 1, True)
+    assert not on(MANY_RAYS, False)
+    assert not on(MANY_RAYS, True, "meta")
 
 
 def test_another_thread_leaves_a_threads_precision_as_it_is(
