@@ -57,7 +57,12 @@ def swapped_config(
     """
     if file is not None and learn_seconds is not None:
         raise InputError("--occupancy gives what --learn-seconds would learn: leave one out")
-    check_sampler(file, sampler, options)
+    try:
+        gate = LEARNING.sizes.gate if file is None else load_occupancy(file).gate.config
+        check_gate(sampler, gate)
+        refuse_unknown_options(sampler, options)
+    except ValueError as error:
+        raise InputError(str(error)) from None
     config = tyro.cli(
         tyro.conf.SuppressFixed[tyro.conf.FlagConversionOff[TrainerConfig]],
         default=registered(method),
@@ -74,17 +79,6 @@ def swapped_config(
     made = with_sampler_swapped(config, file, sampler, options, codes, other_scene)
     made.pipeline.model.occupancy.seconds = learn_seconds  # type: ignore[attr-defined]
     return made
-
-
-def check_sampler(file: Path | None, sampler: str, options: Mapping[str, int | float]) -> None:
-    """InputError unless there is an occupancy (None is one that will be learned), and a sampler
-    with these options that asks gates of its kind."""
-    try:
-        gate = LEARNING.sizes.gate if file is None else load_occupancy(file).gate.config
-        check_gate(sampler, gate)
-        refuse_unknown_options(sampler, options)
-    except ValueError as error:
-        raise InputError(str(error)) from None
 
 
 def registered(method: str) -> TrainerConfig:

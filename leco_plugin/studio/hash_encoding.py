@@ -53,10 +53,6 @@ class CpuHashEncoding(HashEncoding):
         flat = torch.cat([_Interpolated.apply(part, table, self) for part in parts])
         return flat.view(*in_tensor.shape[:-1], flat.shape[-1])
 
-    def by_nerfstudio(self, in_tensor: Tensor) -> Tensor:
-        """The same as nerfstudio computes it, of which any derivative can be had."""
-        return super().pytorch_fwd(in_tensor)
-
 
 class _Interpolated(torch.autograd.Function):
     """Features [N, levels * features] of positions [N, 3]."""
@@ -72,26 +68,28 @@ class _Interpolated(torch.autograd.Function):
         summed = torch.nn.functional.embedding_bag(
             rows, table, per_sample_weights=weights, mode="sum"
         )
-        return _by_point(summed, encoding)
+        by_level = summed.view(encoding.num_levels, -1, encoding.features_per_level)
+        return by_level.transpose(0, 1).flatten(1)
 
     @staticmethod
     def backward(  # type: ignore[override]
         ctx: Any, gradient: Tensor
     ) -> tuple[Tensor | None, Tensor | None, None]:
         positions, table, *looked_up = ctx.saved_tensors
+        encoding: CpuHashEncoding = ctx.encoding
         if torch.is_grad_enabled():  # somebody wants to differentiate the gradient
-            encoded = ctx.encoding.by_nerfstudio(positions)
+            encoded = HashEncoding.pytorch_fwd(encoding, positions)  # of which any can be had
             return _gradients(encoded, positions, table, gradient)
         of_positions = of_table = None
         if not looked_up and ctx.needs_input_grad[1]:
-            scalings = ctx.encoding.scalings
-            of_table = hash_gradients(positions, scalings, gradient, len(table), corners=8)
+            of_table = hash_gradients(positions, encoding.scalings, gradient, len(table), corners=8)
             if not ctx.needs_input_grad[0]:
                 return None, of_table, None
-        rows, weights = looked_up or _rows_and_weights(positions, ctx.encoding)
-        by_level = _by_level(gradient, ctx.encoding)
+        rows, weights = looked_up or _rows_and_weights(positions, encoding)
+        by_point = gradient.view(-1, encoding.num_levels, encoding.features_per_level)
+        by_level = by_point.transpose(0, 1).flatten(0, 1)
         if ctx.needs_input_grad[0]:
-            of_positions = _of_positions(positions, table, rows, by_level, ctx.encoding.scalings)
+            of_positions = _of_positions(positions, table, rows, by_level, encoding.scalings)
         if ctx.needs_input_grad[1] and of_table is None:
             of_table = sum_by_row(rows, weights, by_level, len(table))
         return of_positions, of_table, None
@@ -128,18 +126,6 @@ def _at_corners(
     x, y, z = zip(lower, upper)
     in_y_and_z = [combine(at_y, at_z) for at_y in y for at_z in z]
     torch.stack([combine(beside, at_x) for beside in in_y_and_z for at_x in x], dim=-1, out=out)
-
-
-def _by_point(by_level: Tensor, encoding: HashEncoding) -> Tensor:
-    """[levels * N, features] to [N, levels * features]."""
-    levels, features = encoding.num_levels, encoding.features_per_level
-    return by_level.view(levels, -1, features).transpose(0, 1).reshape(-1, levels * features)
-
-
-def _by_level(by_point: Tensor, encoding: HashEncoding) -> Tensor:
-    """[N, levels * features] to [levels * N, features]."""
-    levels, features = encoding.num_levels, encoding.features_per_level
-    return by_point.view(-1, levels, features).transpose(0, 1).reshape(-1, features)
 
 
 def _of_positions(
