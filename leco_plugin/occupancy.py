@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from leco_plugin.models.frozen_gate import occupancy_of
 from leco_plugin.models.gate import Gate, GateConfig, check_sizes
 from leco_plugin.samplers.kernels import fused
+from leco_plugin.scenes.input_error import first_line
 from leco_plugin.scenes.whole_files import write_whole
 from leco_plugin.seen import SeenSpace, cells_from_bytes
 from leco_plugin.space import NO_WALL, Space
@@ -229,11 +230,11 @@ class Occupancy(nn.Module):
                 header = file.metadata() or {}
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         except OSError as error:
-            raise OSError(f"{path} cannot be read: {_line(error)}") from None
+            raise OSError(f"{path} cannot be read: {first_line(error)}") from None
         except (SafetensorError, *_UNREADABLE) as error:
             raise ValueError(
-                f"{path} is no safetensors file, or not a whole one ({_line(error)}): give the "
-                "occupancy.safetensors of a run"
+                f"{path} is no safetensors file, or not a whole one ({first_line(error)}): give "
+                "the occupancy.safetensors of a run"
             ) from None
         return cls._checked(path, header, tensors).to(device)
 
@@ -256,13 +257,13 @@ class Occupancy(nn.Module):
             report = json.loads(header["report"])
             expected = _expected_shapes(config)
         except _UNREADABLE as error:
-            raise ValueError(f"{path} has a damaged header: {_line(error)}") from None
+            raise ValueError(f"{path} has a damaged header: {first_line(error)}") from None
         _check_shapes(path, tensors, expected)
         _check_values(path, tensors)
         try:
             cells = None if seen is None else cells_from_bytes(seen)
         except ValueError as error:
-            raise ValueError(f"{path}: tensor {SEEN!r} is damaged: {_line(error)}") from None
+            raise ValueError(f"{path}: tensor {SEEN!r} is damaged: {first_line(error)}") from None
         stored = tensors if seen is None else tensors | {SEEN: seen}
         if header.get("sha256") != _digest(header, stored):
             raise ValueError(f"{path} is damaged: its contents do not match its checksum")
@@ -321,11 +322,6 @@ _UNREADABLE = (
     ValueError,
 )
 """Errors of json and torch on a damaged header."""
-
-
-def _line(error: BaseException) -> str:
-    """The first line of an error's message, or the name of its type."""
-    return next(iter(str(error).splitlines()), type(error).__name__)
 
 
 def _digest(header: dict[str, str], tensors: dict[str, Tensor]) -> str:

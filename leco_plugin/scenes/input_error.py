@@ -55,3 +55,8 @@ def require_folder(path: Path, remedy: str) -> None:
 def one_line(error: BaseException, most: int | None = None) -> str:
     """What an error says, in one line of at most so many characters; empty if it says nothing."""
     return " ".join(str(error).split())[:most]
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of an error's message, or the name of its type where that says nothing."""
+    return next(iter(str(error).splitlines()), "") or type(error).__name__

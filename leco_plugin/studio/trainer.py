@@ -25,7 +25,7 @@ from leco_plugin.log import counted, say, say_what_is_logged
 from leco_plugin.models.compute.ranks import is_first
 from leco_plugin.names import options_in
 from leco_plugin.samplers.kernels import VARIABLE, kernels_off
-from leco_plugin.scenes.input_error import InputError, TrainingStopped
+from leco_plugin.scenes.input_error import InputError, TrainingStopped, first_line
 from leco_plugin.studio.checkpoints import first_not_finite, previous_of, step_of, whole_of
 from leco_plugin.studio.run_folder import (
     check_photographs,
@@ -242,7 +242,7 @@ class AtomicTrainer(Trainer):
             try:
                 self._save_whole(step)
             except (OSError, RuntimeError) as error:  # as which torch reports a disk that is full
-                reason = next(iter(str(error).splitlines()), type(error).__name__)
+                reason = first_line(error)
         self.saved_at = time.monotonic()
         self.save_seconds = self.saved_at - started
         if reason is None:

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from leco_plugin.models.compute.dispatch import permute_rows
 from leco_plugin.samplers.kernels import kernels_off
+from leco_plugin.scenes.input_error import first_line
 
 if TYPE_CHECKING:
     from leco_plugin.models.hmoe import Expert
@@ -41,7 +42,7 @@ def is_grouping_faster(device: torch.device, n: int, width: int) -> bool:
                 return False
             grouped, plain = race(device, n, width)
         except (RuntimeError, TypeError, ValueError) as error:  # running out of memory among them
-            reason = next(iter(str(error).splitlines()), "") or type(error).__name__
+            reason = first_line(error)
             _log.warning("no grouped products, one for each expert in their place: %s", reason)
             return False
     _log.info(

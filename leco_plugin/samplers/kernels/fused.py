@@ -31,6 +31,7 @@ from leco_plugin.samplers.kernels.gate_weights import (
 )
 from leco_plugin.samplers.marching import Samples
 from leco_plugin.samplers.rays import Candidates, March, Rays, TooManyCandidates, number
+from leco_plugin.scenes.input_error import first_line
 
 _log = logging.getLogger(__name__)
 
@@ -138,7 +139,7 @@ def attempt(name: str, kernel: Callable[[], Answer], device: torch.device) -> An
         raise
     except Exception as error:  # noqa: BLE001 - a compiler and its driver raise what they like
         _off.update((name, "march"))
-        reason = next(iter(str(error).splitlines()), "") or type(error).__name__
+        reason = first_line(error)
         _log.warning("the fused %s does not run, torch answers in its place: %s", name, reason)
         return None
 
