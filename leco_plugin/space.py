@@ -75,11 +75,8 @@ class Space(nn.Module):
         return "contraction" if bool(self.unbounded) else "box"
 
     def set(self, kind: SpaceKind, center: Tensor, half_extent: float) -> None:
-        """Redefines the mapping in place.
-
-        Raises:
-            ValueError: when the half extent is not a positive finite number or the kind is unknown.
-        """
+        """Redefines the mapping in place. ValueError if the half extent is not a positive finite
+        number, or the kind is unknown."""
         if not (half_extent > 0.0 and half_extent < float("inf")):
             raise ValueError(f"a space needs a positive, finite half extent, got {half_extent}")
         if kind not in ("box", "contraction"):

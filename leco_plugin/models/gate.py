@@ -83,12 +83,9 @@ LARGEST_SIZES = {
 
 
 def check_sizes(config: GateConfig) -> None:
-    """Refuses a gate that cannot be built or saved, before anything of it is allocated.
-
-    Raises:
-        ValueError: an unknown kind of encoding, a size that is no whole number or out of range, a
-            norm that is neither there nor not, or more than `MOST_VALUES` learned values. One line.
-    """
+    """ValueError, in one line and before anything is allocated, for a gate that cannot be built or
+    saved: an unknown kind of encoding, a size that is no whole number or out of range, a norm that
+    is neither there nor not, or more than `MOST_VALUES` learned values."""
     if config.encoding.kind not in get_args(Kind):
         raise ValueError(f"the gate's encoding is of an unknown kind {config.encoding.kind!r}")
     if type(config.normed) is not bool:

@@ -181,12 +181,8 @@ class LecoModel(DrawnInViewer, Model):
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: Any = None
     ) -> dict[str, Tensor]:
-        """Colour loss, distortion loss, and before the gate is frozen what teaches it.
-
-        Raises:
-            ValueError: the batch holds no rays.
-            FloatingPointError: a loss is not finite; the step was not taken.
-        """
+        """Colour loss, distortion loss, and before the gate is frozen what teaches it. ValueError
+        if the batch holds no rays, FloatingPointError if a loss is not finite: no step is taken."""
         shaded: Shaded = outputs["shaded"]
         batch_of = shaded, outputs["intervals"], outputs["rays"]
         config, region, plan = self.config, self.mixture.region, self.plan
@@ -234,19 +230,11 @@ class LecoModel(DrawnInViewer, Model):
         return {"progress": self.progress.to_dict()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restores what `get_extra_state` gave.
-
-        Raises:
-            InputError: the state is of another version of this package.
-        """
+        """Restores what `get_extra_state` gave. InputError if it is of another version."""
         with state_of_this_version():
             self.progress = Progress.from_dict(state["progress"])
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
-        """As torch's.
-
-        Raises:
-            InputError: the checkpoint is of an earlier version of this package.
-        """
+        """As torch's. InputError if the checkpoint is of an earlier version of this package."""
         refuse_earlier(state_dict, prefix, "mixture.region.lowest")
         super()._load_from_state_dict(state_dict, prefix, *rest)

@@ -293,10 +293,7 @@ class Mixture(nn.Module):
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         """Gate and field are first built as they were stored, whatever the scene is now.
-
-        Raises:
-            InputError: the state is of another release.
-        """
+        InputError if the state is of another release."""
         extra = state_dict.get(f"{prefix}_extra_state")
         if extra is not None:
             with state_of_this_version():
@@ -311,11 +308,7 @@ class Mixture(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restores what `get_extra_state` gave.
-
-        Raises:
-            InputError: the state is of another version of this package.
-        """
+        """Restores what `get_extra_state` gave. InputError if it is of another version."""
         with state_of_this_version():
             require_keys(state, (SIZES, "precision", "routing", "report", "small"))
             self.precision, self.report = state["precision"], dict(state["report"])

@@ -252,11 +252,8 @@ class SwitchNerfModel(Model):
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: Any = None
     ) -> dict[str, Tensor]:
-        """Colour loss and balanced gate loss.
-
-        Raises:
-            FloatingPointError: a loss is not finite; the step was not taken.
-        """
+        """Colour loss and balanced gate loss. FloatingPointError if one is not finite: no step is
+        taken."""
         image = batch["image"].to(self.device)
         truth = self.renderer_rgb.blend_background(image)
         losses = switch_losses(outputs["shaded"], truth, self.config.balance)

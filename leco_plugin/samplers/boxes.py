@@ -13,11 +13,8 @@ from torch import Tensor
 
 
 def checked_box(aabb: Sequence[float] | Tensor) -> Tensor:
-    """A box as float32 [6] of (min, max), on the device it came from.
-
-    Raises:
-        ValueError: it is not six finite numbers, or it is empty.
-    """
+    """A box as float32 [6] of (min, max), on the device it came from. ValueError if it is not six
+    finite numbers, or empty."""
     try:
         box = torch.as_tensor(aabb).detach().float().reshape(-1)
     except (TypeError, ValueError, RuntimeError):

@@ -193,10 +193,7 @@ class Candidates(NamedTuple):
 
 def plan(rays: Rays, rule: March) -> tuple[Candidates, int, int]:
     """The candidates of each ray, and the least and most of any ray (the one wait for the device).
-
-    Raises:
-        ValueError: as `marching.march`.
-    """
+    ValueError as of `marching.march`."""
     candidates = number(rays, rule)
     counts, shortest, longest = candidates.counts, 0, 0
     if len(counts):
@@ -237,13 +234,8 @@ def number(rays: Rays, rule: March) -> Candidates:
 
 
 def check_longest(highest: int, n_rays: int, step_size: float) -> None:
-    """Refuse a ray with more steps than a float32 can number.
-
-    Args:
-        highest: steps of a ray from its t_min to its last candidate, the most of any.
-    Raises:
-        TooManyCandidates: those are more than 2^24.
-    """
+    """TooManyCandidates if a ray has more steps than a float32 can number, 2^24; `highest` counts
+    those from its t_min to its last candidate, the most of any."""
     if highest > MAX_CANDIDATES_PER_RAY:
         raise TooManyCandidates(
             f"the longest of {n_rays} rays has over 2^24 steps of {step_size:g}: give a far "
@@ -253,13 +245,9 @@ def check_longest(highest: int, n_rays: int, step_size: float) -> None:
 
 
 def check_rays(rays: Rays) -> None:
-    """Raise unless the tensors describe one batch of rays.
-
-    Raises:
-        ValueError: a tensor is not [n_rays, 3] or [n_rays] as it should be, its type or device
-            differs from that of the origins, or the type is not float32 or float64 (half precision
-            cannot tell neighbouring steps apart).
-    """
+    """ValueError unless the tensors describe one batch of rays: each is [n_rays, 3] or [n_rays], of
+    the type and on the device of the origins, and in float32 or float64 (half precision cannot tell
+    neighbouring steps apart)."""
     origins = rays.origins
     if origins.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"rays must be float32 or float64, got {origins.dtype}")

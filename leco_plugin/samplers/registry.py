@@ -120,11 +120,8 @@ def build_proposal(name: str, **options: Any) -> nn.Module:
 
 
 def sampler_spec(name: str) -> SamplerSpec:
-    """The sampler of that name, or the spec at "module:attribute", registered or not.
-
-    Raises:
-        ValueError: there is none, or what is registered under it is of no use.
-    """
+    """The sampler of that name, or the spec at "module:attribute", registered or not. ValueError if
+    there is none, or what is registered under it is of no use."""
     if ":" in name:
         found: object = _load(name)
         if not isinstance(found, SamplerSpec):
@@ -143,10 +140,7 @@ def sampler_spec(name: str) -> SamplerSpec:
 
 def spec_for(name: str, kind: str, options: Collection[str]) -> SamplerSpec:
     """The sampler of that name, which serves hosts that call this kind and takes these options.
-
-    Raises:
-        ValueError: there is none, or it does not.
-    """
+    ValueError if there is none, or it does not."""
     spec = sampler_spec(name)
     if getattr(spec, kind) is None:
         raise ValueError(f"sampler {name!r} has nothing for {HOSTS[kind]} hosts")
@@ -201,13 +195,8 @@ def has_option(name: str, kind: str, option: str) -> bool:
 def refuse_unknown_options(
     name: str, options: Collection[str], kinds: tuple[str, ...] = tuple(HOSTS)
 ) -> None:
-    """Refuse options that a sampler does not take in hosts that call one of these kinds.
-
-    A builder that takes any (`**options`) is not checked.
-
-    Raises:
-        ValueError: there is no such sampler, or it does not take one of them.
-    """
+    """ValueError if there is no such sampler, or it does not take one of these options in hosts
+    that call one of these kinds. A builder that takes any (`**options`) is not checked."""
     spec = sampler_spec(name)
     if not options:
         return
@@ -223,11 +212,8 @@ def refuse_unknown_options(
 
 
 def check_gate(name: str, config: Any) -> None:
-    """Refuse a sampler that cannot ask gates of this config (`GateConfig`; None is no gate).
-
-    Raises:
-        ValueError: there is no such sampler, or it asks gates on other features.
-    """
+    """ValueError if there is no such sampler, or it asks gates on other features than those of this
+    config (`GateConfig`; None is no gate)."""
     wanted = sampler_spec(name).gate_encoding
     found = config.encoding.kind if config is not None else "no"
     if wanted not in (None, found):

@@ -29,16 +29,9 @@ OF_A_PROCESSOR = ("vendor_id", "cpu family", "model", "stepping", "flags", "CPU 
 
 
 def compiled(command: Sequence[str], sources: Sequence[Path]) -> ctypes.CDLL:
-    """The library that a compiler makes of these sources, or has made of them earlier.
-
-    Args:
-        command: the compiler and its flags.
-        sources: C files.
-
-    Raises:
-        OSError: the compiler cannot be started, or its library cannot be loaded.
-        subprocess.SubprocessError: it fails, or takes longer than `SECONDS`.
-    """
+    """The library that a compiler, with these flags, makes of C files, or has made of them earlier.
+    OSError if it cannot be started, or its library cannot be loaded; subprocess.SubprocessError if
+    it fails, or takes longer than `SECONDS`."""
     folder = cache_folder()
     kept = folder / f"native-{digest(command, sources)}.so" if folder else None
     library = _load(kept)

@@ -143,11 +143,8 @@ def to_store(sizes: Sizes, images: int) -> dict[str, Any]:
 
 
 def from_stored(values: dict[str, Any], sizes: Sizes) -> tuple[Sizes, int]:
-    """Inverse of `to_store`; what it does not hold is that of `sizes`.
-
-    Raises:
-        InputError: there is a size in it that this release does not know.
-    """
+    """Inverse of `to_store`; what it does not hold is that of `sizes`. InputError if there is a
+    size in it that this release does not know."""
     try:
         field = dict(values["field"])
         field["encoding"] = EncodingConfig(**field["encoding"])
@@ -171,11 +168,8 @@ def sizes_in(checkpoint: Path) -> dict[str, Any] | None:
 
 
 def sizes_to_resume(wanted: Sizes, stored: dict[str, Any]) -> Sizes:
-    """The sizes of a resumed run: those it was begun with.
-
-    Raises:
-        InputError: a size set by hand is another one.
-    """
+    """The sizes of a resumed run: those it was begun with. InputError if a size set by hand is
+    another one."""
     sizes, _ = from_stored(stored, wanted)
     filled = wanted
     for path in left_open(wanted):
@@ -228,11 +222,8 @@ LEAST_BATCH = 0.125
 
 
 def check(sizes: Sizes) -> None:
-    """Refuses what cannot be built, before anything of it is allocated.
-
-    Raises:
-        ValueError: in one line, what does not go together and what to change.
-    """
+    """ValueError, before anything is allocated, for what cannot be built: it says in one line what
+    does not go together and what to change."""
     check_sizes(sizes.gate)
     _check_field(sizes)
     for name in MARCHED:

@@ -121,10 +121,7 @@ def build_cache(
 
 def _finest_of_use(probe: Tensor) -> float:
     """The resolution beyond which cells are not worth their time, from the states of a probe.
-
-    Raises:
-        ValueError: the gate's boundary crosses too many of its cells.
-    """
+    ValueError if the gate's boundary crosses too many of its cells."""
     mixed = int((probe == MIXED).sum())
     if mixed > ROUGH * PROBE**3:
         raise ValueError(

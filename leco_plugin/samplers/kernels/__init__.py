@@ -16,10 +16,7 @@ NAMES = frozenset({"gate", "march", "experts", "native"})
 
 def kernels_off() -> frozenset[str]:
     """Names of the kernels that are not to be used, separated by commas or spaces; `all` is all.
-
-    Raises:
-        ValueError: there is no kernel of such a name.
-    """
+    ValueError if there is no kernel of such a name."""
     names = frozenset(os.environ.get(VARIABLE, "").replace(",", " ").split())
     if unknown := sorted(names - NAMES - {"all"}):
         known = ", ".join(sorted(NAMES))

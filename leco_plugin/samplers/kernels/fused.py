@@ -107,7 +107,6 @@ def march(occupancy: object, cache: CellCache | None, rays: Rays, rule: March) -
     Args:
         occupancy: an `Occupancy`, or anything else that an estimator asks.
         cache: the cells of its decisions.
-
     Raises:
         ValueError: as `marching.march`.
     """
@@ -222,11 +221,7 @@ def _march_kept(cache: CellCache, weights: GateWeights, candidates: Candidates) 
 
 
 def compare_gate(occupancy: nn.Module, weights: GateWeights) -> None:
-    """Compares the gate's kernel with `Occupancy.query`.
-
-    Raises:
-        ValueError: it decides otherwise.
-    """
+    """ValueError if the gate's kernel decides otherwise than `Occupancy.query`."""
     positions = _places(weights, COMPARED)
     kept = _gate_decisions(weights, positions)
     o = occupancy.query(positions)  # type: ignore[operator]
@@ -239,13 +234,8 @@ def compare_gate(occupancy: nn.Module, weights: GateWeights) -> None:
 def compare_march(
     occupancy: nn.Module, cache: CellCache, weights: GateWeights, growing: bool
 ) -> None:
-    """Compares the march's kernel with `marching.march` on rays of unequal lengths.
-
-    Args:
-        growing: whether the step grows with distance, which is another kernel.
-    Raises:
-        ValueError: it keeps other candidates, or in another order.
-    """
+    """ValueError if the march's kernel keeps other candidates than `marching.march` on rays of
+    unequal lengths, or in another order; where the step is `growing`, it is another kernel."""
 
     def occupied(positions: Tensor) -> Tensor:
         decided, left_open = cache.decide(positions)

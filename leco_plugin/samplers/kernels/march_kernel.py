@@ -269,16 +269,12 @@ def _march_kernel(
 
 
 def march_kept(cache: CellCache, weights: GateWeights, candidates: Candidates) -> Samples:
-    """Packed kept intervals of rays, with one wait for the device between the two launches.
+    """As `marching.march` returns it, what is kept of rays, with one wait for the device.
 
     Args:
         cache: the cells of the gate's decisions.
         weights: the gate, as `gate_weights` packs it.
         candidates: those of the rays, float32.
-
-    Returns:
-        As `marching.march` returns them.
-
     Raises:
         ValueError: a ray would have more than 2^24 candidates.
     """

@@ -19,15 +19,8 @@ CANDIDATES_AT_ONCE = 1 << 22
 
 @torch.no_grad()
 def march(occupied: OccupiedFn, cache: CellCache | None, rays: Rays, rule: March) -> Samples | None:
-    """The candidates that a frozen gate keeps; None: ask the torch twin.
-
-    Args:
-        occupied: the gate's decisions.
-        cache: cells of them.
-
-    Raises:
-        ValueError: as `marching.march`.
-    """
+    """The candidates that a frozen gate keeps, by its decisions and cells of them; None: ask the
+    torch twin. ValueError as of `marching.march`."""
     if cache is None or not native.suits(rays.origins, cache.scale):
         return None
     candidates, _, longest = plan(rays, rule)
