@@ -10,6 +10,7 @@ from nerfstudio.model_components.renderers import RGBRenderer
 from torch import Tensor
 
 from leco_plugin.evaluation.metrics import image_metrics
+from leco_plugin.learning.calibration import LOSSES
 from leco_plugin.models.gate import EMPTY, occupancy_from_logits
 from leco_plugin.models.losses import expert_statistics
 from leco_plugin.models.rendering import MET, Intervals, Rays, Shaded, backdrop_of, sum_up
@@ -111,10 +112,6 @@ def image_figures(
     return image_metrics(predicted, truth), pictures
 
 
-PRICES = ("lost_mass", "lost_surface_mass", "image_price_db")
-"""What skipping costs, as a report has it."""
-
-
 @torch.no_grad()
 def gate_statistics(shaded: Shaded, scene_experts: int) -> dict[str, Tensor]:
     """Samples per ray, and for each expert its share of them and their mean density: float scalars.
@@ -174,5 +171,5 @@ def prices(report: dict[str, Any]) -> dict[str, Tensor]:
     Args:
         report: of the gate; empty before it is frozen, and None where no field measured it.
     """
-    known = {name: report.get(name) for name in PRICES}
+    known = {name: report.get(name) for name in LOSSES}
     return {name: torch.tensor(float(x)) for name, x in known.items() if x is not None}

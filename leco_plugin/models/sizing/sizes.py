@@ -4,7 +4,8 @@ cannot be built or trained."""
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -174,29 +175,22 @@ def sizes_to_resume(wanted: Sizes, stored: dict[str, Any]) -> Sizes:
     filled = wanted
     for path in left_open(wanted):
         filled = with_size(filled, path, size_at(sizes, path))
-    if filled == sizes:
-        return sizes
-    differing = next(
-        path for path in _paths(sizes) if size_at(filled, path) != size_at(sizes, path)
-    )
-    raise InputError(
-        f"{CLI}.{differing.replace('_', '-')} is {size_at(filled, differing)}, and the run that is "
-        f"gone on with has {size_at(sizes, differing)}: leave it out, or begin a new run"
-    )
+    for path in _differing(filled, sizes):
+        raise InputError(
+            f"{CLI}.{path.replace('_', '-')} is {size_at(filled, path)}, and the run that is "
+            f"gone on with has {size_at(sizes, path)}: leave it out, or begin a new run"
+        )
+    return sizes
 
 
-def _paths(sizes: Sizes) -> list[str]:
-    """Dotted paths of everything that a run goes on with as it was begun."""
-
-    def below(values: dict[str, Any], path: str) -> list[str]:
-        found: list[str] = []
-        for name, value in values.items():
-            at = f"{path}.{name}"
-            found += below(value, at) if isinstance(value, dict) else [at]
-        return found
-
-    stored = to_store(sizes, 0)
-    return [*below(stored["gate"], "gate"), *below(stored["field"], "field"), *MARCHED]
+def _differing(some: Any, others: Any) -> Iterator[str]:
+    """Dotted paths of the sizes that two have otherwise."""
+    for name in (each.name for each in fields(some)):
+        one, other = getattr(some, name), getattr(others, name)
+        if is_dataclass(one):
+            yield from (f"{name}.{path}" for path in _differing(one, other))
+        elif one != other:
+            yield name
 
 
 BYTES_PER_VALUE = 16
