@@ -109,12 +109,8 @@ class GateHistory:
 
     @classmethod
     def load_before(cls, checkpoint: Path, step: int, gate: Gate) -> GateHistory:
-        """The looks of a run before the step at which it resumes; none if it stored none of this
-        gate.
-
-        Args:
-            checkpoint: of that run, or its folder of checkpoints.
-        """
+        """The looks of a run, given by a checkpoint or its folder of checkpoints, before the step
+        at which it resumes; none if it stored none of this gate."""
         checkpoints = checkpoint if checkpoint.is_dir() else checkpoint.parent
         try:
             found = cls.load(checkpoints.parent / FILE_NAME, gate)

@@ -72,12 +72,8 @@ def ramp(step: int, config: ScheduleConfig) -> float:
 
 
 def converged(step: int, agreement: float, config: ScheduleConfig) -> bool:
-    """Whether to freeze at this check.
-
-    Args:
-        step: steps since `Progress.began`.
-        agreement: share of probe decisions equal to those of the check before; 0 at the first.
-    """
+    """Whether to freeze at this check, so many steps after `Progress.began`; `agreement` is the
+    share of probe decisions equal to those of the check before, 0 at the first."""
     early = step + 1 < config.earliest * config.learn_steps
     return step + 1 >= config.learn_steps or (not early and agreement >= config.agreement)
 

@@ -81,10 +81,8 @@ def teach(
 ) -> Gate:
     """A new gate, taught by a lesson in `precision` and rounded to bfloat16.
 
-    Minimises mean[-keep log o - skip log(1 - o)], the contribution loss with given targets.
-
-    Args:
-        steps: of Adam, on `BATCH` positions each.
+    Minimises mean[-keep log o - skip log(1 - o)], the contribution loss with given targets, in
+    steps of Adam on `BATCH` positions each.
     """
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(seed)  # `torch.manual_seed` seeds all cards too

@@ -34,12 +34,9 @@ def over_background(shaded: Shaded, rays: Rays) -> Tensor:
 def before_the_backdrop(
     shaded: Shaded, intervals: Intervals, rays: Rays
 ) -> tuple[Shaded, dict[str, Tensor]]:
-    """A rendering with weights, accumulation and depth of what lies before the backdrop alone.
-
-    Returns:
-        That rendering, and its `depth` and `accumulation`, [R, 1] each. A ray with an accumulation
-        below `MET` meets nothing, and has depth `t_maxs`, scene units.
-    """
+    """A rendering with weights, accumulation and depth of what lies before the backdrop alone, and
+    its `depth` and `accumulation`, [R, 1] each. A ray with an accumulation below `MET` meets
+    nothing, and has depth `t_maxs`, scene units."""
     met = shaded.weights.detach().masked_fill(backdrop_of(intervals, rays), 0.0)
     accumulation, depth = sum_up(met, rays, intervals)
     shown = {"depth": depth[:, None], "accumulation": accumulation[:, None]}
@@ -93,12 +90,8 @@ def with_alpha(outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
 def image_figures(
     outputs: dict[str, Tensor], truth: Tensor
 ) -> tuple[dict[str, float], dict[str, Tensor]]:
-    """Figures of one image (see `image_metrics`), and pictures for the log.
-
-    Args:
-        outputs: `rgb` [H, W, 3], `accumulation` and `depth` [H, W, 1].
-        truth: [H, W, 3] behind the method's own background.
-    """
+    """Figures of one image (see `image_metrics`), and pictures for the log, from `rgb` [H, W, 3],
+    `accumulation` and `depth` [H, W, 1]; truth [H, W, 3] is before the method's own background."""
     from nerfstudio.utils import colormaps
 
     predicted = outputs["rgb"].clamp(0.0, 1.0)
@@ -126,12 +119,8 @@ def gate_statistics(shaded: Shaded, scene_experts: int) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def batch_figures(outputs: dict[str, Any], truth: Tensor, experts: int) -> dict[str, Tensor]:
-    """PSNR of a batch, and in training what its gate keeps and how its scene experts share it.
-
-    Args:
-        outputs: of `LecoModel.get_outputs`.
-        truth: [R, 3].
-    """
+    """PSNR of a batch of `LecoModel.get_outputs` against pixels [R, 3], and in training what its
+    gate keeps and how its scene experts share it."""
     error = torch.nn.functional.mse_loss(outputs["rgb"], truth)
     figures = {"psnr": -10.0 * torch.log10(error.clamp(min=1e-12))}
     if "shaded" in outputs:
@@ -166,10 +155,7 @@ def kept_fraction(
 
 
 def prices(report: dict[str, Any]) -> dict[str, Tensor]:
-    """What skipping costs as it was last measured: float scalars.
-
-    Args:
-        report: of the gate; empty before it is frozen, and None where no field measured it.
-    """
+    """What skipping costs as it was last measured: float scalars. The gate's report is empty before
+    it is frozen, and holds None where no field measured it."""
     known = {name: report.get(name) for name in LOSSES}
     return {name: torch.tensor(float(x)) for name, x in known.items() if x is not None}

@@ -68,11 +68,8 @@ def is_no_slower(scene: Scene, rays: Rays, intervals: Intervals, guided: bool) -
 
 @torch.no_grad()
 def shade_front_to_back(scene: Scene, rays: Rays, intervals: Intervals) -> tuple[Shaded, Intervals]:
-    """Renders packed intervals; arguments as for `rendering.shade`, without gradients.
-
-    Returns:
-        The rendering, and the intervals that were asked about, to which it belongs.
-    """
+    """As `rendering.shade`, without gradients, and the intervals that were asked about, to which
+    the rendering belongs."""
     native = suits_native(scene, rays, intervals)
     return (shade_natively if native else shade_in_torch)(scene, rays, intervals)
 
@@ -130,11 +127,8 @@ def asked_first(intervals: Intervals, starts: Tensor) -> Tensor:
 
 
 def samples_of(starts: Tensor, counts: Tensor, most: int) -> Tensor:
-    """Numbers of the packed samples of some rays: starts [R] and counts [R] to [M] int64.
-
-    Args:
-        most: no count is larger.
-    """
+    """Numbers of the packed samples of some rays: starts [R] and counts [R], up to `most`, to [M]
+    int64."""
     steps = torch.arange(most, device=starts.device)
     return (starts[:, None] + steps)[steps < counts[:, None]]
 

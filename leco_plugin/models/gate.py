@@ -162,13 +162,8 @@ def logits_of(features: Tensor, norm: nn.LayerNorm, head: nn.Linear) -> Tensor:
 
 
 def occupancy_from_logits(logits: Tensor) -> Tensor:
-    """1 - softmax(logits)[:, 0], computed as a sigmoid so that neither end loses digits.
-
-    Args:
-        logits: [N, 1 + n] float.
-    Returns:
-        [N] float in [0, 1].
-    """
+    """1 - softmax(logits)[:, 0], [N, 1 + n] to [N] float in [0, 1], computed as a sigmoid so that
+    neither end loses digits."""
     return torch.sigmoid(occupancy_logit(logits))
 
 

@@ -208,11 +208,8 @@ def distortion_loss(
 
 
 def first_non_finite(losses: dict[str, Tensor]) -> str | None:
-    """Name of the first loss that is not finite, or None; waits for the device once.
-
-    Args:
-        losses: of any shapes; hosts also give plain numbers.
-    """
+    """Name of the first loss that is not finite, or None; waits for the device once. Losses are of
+    any shapes; hosts also give plain numbers."""
     tensors = [torch.as_tensor(loss).detach() for loss in losses.values()]
     device = next((loss.device for loss in tensors if loss.device.type != "cpu"), "cpu")
     values = torch.stack([loss.float().sum().to(device) for loss in tensors]).tolist()
@@ -223,11 +220,8 @@ def require_finite(
     losses: dict[str, Tensor], model: nn.Module, outputs: dict[str, Any], image: Tensor
 ) -> None:
     """FloatingPointError, with the likely cause, for losses that are not finite: no step is taken.
-
-    Args:
-        outputs: of the batch; where they hold `rays` and `shaded`, these are suspects too.
-        image: what the batch was compared with.
-    """
+    `image` is what the batch was compared with; `rays` and `shaded` of its outputs, where they are
+    there, are suspects too."""
     if name := first_non_finite(losses):
         raise FloatingPointError(explain_non_finite(name, model, outputs, image))
 

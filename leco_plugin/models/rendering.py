@@ -205,11 +205,8 @@ def mapped_middles(space: Space, rays: Rays, intervals: Intervals) -> Tensor:
 
 
 def shade(scene: Scene, rays: Rays, intervals: Intervals, freeze_gate: bool) -> Shaded:
-    """Renders packed intervals; only visible samples are coloured.
-
-    Args:
-        freeze_gate: no gradient reaches the gate.
-    """
+    """Renders packed intervals; only visible samples are coloured. With `freeze_gate` no gradient
+    reaches the gate."""
     answers = ask(scene, rays, intervals, freeze_gate)
     return render(scene.field.color, answers, rays, intervals, scene.space.half_extent)
 

@@ -25,11 +25,8 @@ def checked_box(aabb: Sequence[float] | Tensor) -> Tensor:
 
 
 def nested_boxes(box: Sequence[float] | Tensor, levels: int) -> list[Tensor]:
-    """A box [6] and others around it, each twice as wide as the one before.
-
-    Raises:
-        ValueError: the box is empty or not finite, or there is not even one level.
-    """
+    """A box [6] and others around it, each twice as wide as the one before. ValueError if the box
+    is empty or not finite, or there is not even one level."""
     if levels < 1:
         raise ValueError(f"there is at least one box, not {levels}")
     inner = checked_box(box)
@@ -56,11 +53,8 @@ def intersect_box(origins: Tensor, directions: Tensor, aabb: Tensor) -> tuple[Te
 
 
 def cell_centers(aabbs: Tensor, resolution: Tensor) -> Tensor:
-    """Centres of the cells of boxes [n_boxes, 6], z fastest: [n_boxes * cells, 3].
-
-    Args:
-        resolution: cells along each axis, int [3].
-    """
+    """Centres of the cells of boxes [n_boxes, 6], z fastest, [n_boxes * cells, 3]; `resolution` has
+    the cells along each axis, int [3]."""
     axes = [(torch.arange(cells, device=aabbs.device) + 0.5) / cells for cells in resolution]
     units = torch.cartesian_prod(*axes)
     low, high = aabbs[:, None, :3], aabbs[:, None, 3:]

@@ -157,11 +157,8 @@ def _within(counts: Tensor, n_steps: int) -> Tensor:
 def cut(
     candidates: Candidates, n_steps: int, near_occupied: NearFn | None
 ) -> tuple[Tensor, Candidates]:
-    """Cut rays of up to `n_steps` candidates into runs, and keep those near something occupied.
-
-    Returns:
-        ray of each run, int64 [n_runs], and the runs as if each were a ray.
-    """
+    """Cut rays of up to `n_steps` candidates into runs, and keep those near something occupied: the
+    ray of each, int64 [n_runs], and the runs as if each were a ray."""
     numbers = candidates.numbers(n_steps + RUN, RUN)
     wanted = numbers[:-1, None] < candidates.counts
     if near_occupied is not None:

@@ -267,12 +267,8 @@ def check_rays(rays: Rays) -> None:
 
 
 def usable_rays(coordinates: Tensor, t_mins: Tensor, t_maxs: Tensor) -> Tensor:
-    """Which rays are finite, go somewhere and begin before they end: bool [n_rays].
-
-    Args:
-        coordinates: origins and directions, [2, 3, n_rays].
-        t_mins, t_maxs: where each ray begins and ends, [n_rays].
-    """
+    """Which rays are finite, go somewhere and begin before they end, bool [n_rays], by their
+    origins and directions [2, 3, n_rays], and where they begin and end [n_rays]."""
     origins, directions = coordinates.abs().amax(dim=1)
     largest = torch.maximum(origins, directions).maximum(t_mins.abs())  # NaN if anything is
     return (largest < torch.inf) & (directions > 0.0) & (t_mins < t_maxs)

@@ -254,11 +254,8 @@ def build_learned(
 def foreign_entries(
     group: str, kind: type[Kind], ours: frozenset[str] = frozenset()
 ) -> dict[str, Kind]:
-    """Loads the entries of a group but for `ours`; a broken one is left out with a warning.
-
-    Args:
-        kind: what an entry of this group has to name.
-    """
+    """Loads the entries of a group, which name things of this kind, but for `ours`; a broken one is
+    left out with a warning."""
     entries = [entry for entry in entry_points(group=group) if entry.name not in ours]
     loaded = {}
     for entry in entries:

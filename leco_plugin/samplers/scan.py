@@ -58,11 +58,7 @@ def segments(
     n_rays: int | None = None,
 ) -> Segments | None:
     """Complete whichever description of the rays is given; None when the input is batched.
-
-    Raises:
-        ValueError: the description does not fit `n_samples` (checked by shape only, so that no
-            device is waited for).
-    """
+    ValueError if it does not fit `n_samples`, by shape only, so that no device is waited for."""
     if ray_indices is not None and ray_indices.shape != (n_samples,):
         raise ValueError(f"ray_indices {tuple(ray_indices.shape)} does not fit {n_samples} samples")
     if packed_info is None:

@@ -107,11 +107,8 @@ def race(device: torch.device, n: int, width: int) -> tuple[float, float]:
 
 
 def grouped_product(points: Tensor, weights: Tensor, ends: Tensor) -> Tensor:
-    """Rows [N, width] times the transposed matrix [n, width, width] of their group; [N, width].
-
-    Args:
-        ends: int32 [n], where each group ends; rows beyond the last come back as anything.
-    """
+    """Rows [N, width] times the transposed matrix [n, width, width] of their group, [N, width];
+    groups end at `ends`, int32 [n], and rows beyond the last come back as anything."""
     return nn.functional.grouped_mm(points, weights.mT, offs=ends)
 
 
@@ -168,14 +165,8 @@ def grouped_dispatch(features: Tensor, routes: Tensor, experts: Sequence[Expert]
 
 
 def may_group(features: Tensor, n: int, width: int) -> bool:
-    """Whether `grouped_dispatch` serves: bfloat16 on CUDA where a trial finds it right and faster.
-
-    Rows must be multiples of 16 bytes, and there must be some.
-
-    Args:
-        features: [N, width].
-        n: number of experts.
-    """
+    """Whether `grouped_dispatch` of features [N, width] to n experts serves: bfloat16 on CUDA where
+    a trial finds it right and faster. There must be rows, in multiples of 16 bytes."""
     device = features.device.type
     if device != "cuda" or width % 8 or not len(features):
         return False

@@ -118,12 +118,8 @@ def of_points(name: str, before: Sequence[Any], count: int, after: Sequence[Any]
 def hash_gradients(
     positions: Tensor, resolutions: Tensor, gradient: Tensor, rows: int, corners: int
 ) -> Tensor:
-    """Gradient [rows, F] of the table, from that of `hash_sums`; no sum depends on the threads.
-
-    Args:
-        gradient: [N, L F] float32.
-        rows: of the table; the others as in `hash_sums`.
-    """
+    """Gradient [rows, F] of the table, from that of `hash_sums`, [N, L F] float32; other arguments
+    as there. No sum depends on the threads."""
     levels = len(resolutions)
     features = gradient.shape[-1] // levels
     table = gradient.new_zeros(rows, features)

@@ -29,11 +29,8 @@ def is_first() -> bool:
 
 @torch.no_grad()
 def share(tensors: Iterable[Tensor]) -> None:
-    """Gives the tensors of every process the values they have in the first one, in place.
-
-    Args:
-        tensors: of any types, equally shaped everywhere; with NCCL on the device of the process.
-    """
+    """Gives the tensors of every process the values they have in the first one, in place: of any
+    types, equally shaped everywhere, with NCCL on the device of the process."""
     if not is_distributed():
         return
     for tensor in tensors:

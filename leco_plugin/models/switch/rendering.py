@@ -18,22 +18,16 @@ PADDING = 1e-5
 
 
 def strata(num_rays: int, count: int, jittered: bool, device: torch.device) -> Tensor:
-    """One share in each of `count` equal parts of [0, 1), [num_rays, count] ascending.
-
-    Args:
-        jittered: at random in its part (stratified sampling), else in its middle.
-    """
+    """One share in each of `count` equal parts of [0, 1), [num_rays, count] ascending: at random in
+    its part if `jittered` (stratified sampling), else in its middle."""
     offsets = torch.rand(num_rays, count, device=device) if jittered else 0.5
     steps = torch.arange(count, dtype=torch.float32, device=device).expand(num_rays, count)
     return (steps + offsets) / count
 
 
 def spread(t_mins: Tensor, t_maxs: Tensor, shares: Tensor, growing: bool) -> Tensor:
-    """Points at shares [R, S] of each ray's way from t_min to t_max, both [R] and positive.
-
-    Args:
-        growing: distances between points grow with distance, as an unbounded scene is marched.
-    """
+    """Points at shares [R, S] of each ray's way from t_min to t_max, both [R] and positive; if
+    `growing`, distances between them grow with distance, as an unbounded scene is marched."""
     starts, ends = t_mins[:, None], t_maxs[:, None]
     if not growing:
         return torch.lerp(starts, ends, shares)
@@ -41,11 +35,8 @@ def spread(t_mins: Tensor, t_maxs: Tensor, shares: Tensor, growing: bool) -> Ten
 
 
 def edges_around(points: Tensor, t_mins: Tensor, t_maxs: Tensor) -> Tensor:
-    """The stretch that each point [R, S] stands for: the part of the ray that is nearest to it.
-
-    Returns:
-        [R, S + 1] edges, from t_min to t_max.
-    """
+    """Edges [R, S + 1], from t_min to t_max, of the stretches that points [R, S] stand for: the
+    part of the ray that is nearest to each."""
     between = 0.5 * (points[:, :-1] + points[:, 1:])
     return torch.cat([t_mins[:, None], between, t_maxs[:, None]], dim=-1)
 

@@ -87,11 +87,8 @@ def is_ready(device: torch.device, name: str = "gate") -> bool:
 
 
 def decide(occupancy: nn.Module, positions: Tensor) -> Tensor | None:
-    """The fused gate's decisions about positions [N, 3], bool [N]; None: ask the torch twin.
-
-    Args:
-        occupancy: an `Occupancy` on the device of the positions.
-    """
+    """The fused gate's decisions about positions [N, 3], bool [N], of an `Occupancy` on their
+    device; None: ask the torch twin."""
     weights = _trusted_weights(occupancy, positions)
     if weights is None:
         return None

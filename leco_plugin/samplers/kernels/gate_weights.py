@@ -65,12 +65,8 @@ class GateWeights(NamedTuple):
 
 
 def why_not(occupancy: Any, most_width: int = MOST_WIDTH) -> str | None:
-    """Why the kernel cannot hold this occupancy's gate, or None if it can.
-
-    Args:
-        occupancy: anything that answers `cache.OccupancyLike`.
-        most_width: widest gate on the device.
-    """
+    """Why the kernel cannot hold the gate of a `cache.OccupancyLike`, or None if it can; the device
+    takes none wider than `most_width`."""
     config = getattr(getattr(occupancy, "gate", None), "config", None)
     if config is None or not hasattr(occupancy, "precision"):
         return "it has no gate of this package"
