@@ -85,8 +85,7 @@ leco_nerfacto = MethodSpecification(
     config=trainer(
         "leco-nerfacto",
         VanillaPipelineConfig(
-            datamanager=photographs(4096 if ON_GPU else 512),
-            model=guided(nerfacto_host()),
+            datamanager=photographs(4096 if ON_GPU else 512), model=guided(nerfacto_host())
         ),
         {"fields": 1e-2, "proposal_networks": 1e-2, "camera_opt": 1e-3},
         mixed_precision=ON_GPU,

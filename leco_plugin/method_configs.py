@@ -17,10 +17,7 @@ from leco_plugin.models.sizing.sizes import PAPER, automatic, sizes_for
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 from leco_plugin.scenes.pixels.known_distances import KnownDistancePixelSamplerConfig
-from leco_plugin.studio.commands import (
-    render_images_without_ffmpeg,
-    show_one_line_in_ns_commands,
-)
+from leco_plugin.studio.commands import render_images_without_ffmpeg, show_one_line_in_ns_commands
 from leco_plugin.studio.processes import DataParallelTrainerConfig
 
 show_one_line_in_ns_commands()

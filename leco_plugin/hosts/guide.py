@@ -31,12 +31,7 @@ from leco_plugin.samplers.registry import (
     spec_for,
 )
 from leco_plugin.scenes.frames import moved, turned
-from leco_plugin.scenes.input_error import (
-    InputError,
-    one_line,
-    require_keys,
-    state_of_this_version,
-)
+from leco_plugin.scenes.input_error import InputError, one_line, require_keys, state_of_this_version
 from leco_plugin.scenes.survey import covering_rays
 from leco_plugin.space import Space
 
@@ -79,9 +74,7 @@ class Guide(nn.Module):
     frame: Tensor
 
     def __init__(
-        self,
-        sampler: str = "learned-occupancy",
-        options: Mapping[str, Any] | None = None,
+        self, sampler: str = "learned-occupancy", options: Mapping[str, Any] | None = None
     ) -> None:
         super().__init__()
         self.sampler = sampler
@@ -168,10 +161,7 @@ class Guide(nn.Module):
         return ~region.shows_backdrop(region.cut(origins.float(), unit))
 
     def estimator(
-        self,
-        aabb: Tensor | None,
-        outermost: Tensor | None = None,
-        levels: int = 1,
+        self, aabb: Tensor | None, outermost: Tensor | None = None, levels: int = 1
     ) -> nn.Module:
         """What goes where a packed host has its estimator.
 

@@ -17,12 +17,7 @@ from torch import Tensor, nn
 from leco_plugin.evaluation.clock import seconds_now
 from leco_plugin.hosts.guide import Guide
 from leco_plugin.hosts.stand_ins import is_packed
-from leco_plugin.learning.calibration import (
-    THRESHOLDS,
-    CalibrationConfig,
-    Measured,
-    promise_below,
-)
+from leco_plugin.learning.calibration import THRESHOLDS, CalibrationConfig, Measured, promise_below
 from leco_plugin.learning.collapse import SUSPECTED_STEPS
 from leco_plugin.learning.dense import evaluating
 from leco_plugin.learning.freezing import leave_file

@@ -101,12 +101,7 @@ def _ending_in_a_backdrop(
 class GuidedEstimator(_StandIn):
     """A packed sampler of the registry, in the host's coordinates."""
 
-    def __init__(
-        self,
-        guide: Guide,
-        aabb: Tensor | None,
-        outermost: Tensor | None = None,
-    ) -> None:
+    def __init__(self, guide: Guide, aabb: Tensor | None, outermost: Tensor | None = None) -> None:
         super().__init__(guide)
         self._aabb = None if aabb is None else aabb.detach().cpu()
         self._outermost = None if outermost is None else outermost.detach().cpu()

@@ -12,11 +12,7 @@ from leco_plugin.models.compute.learned import Colors
 from leco_plugin.models.field import ColorHead, HMoEField
 from leco_plugin.models.gate import EMPTY, Gate, route
 from leco_plugin.samplers.base import midpoints
-from leco_plugin.samplers.packed import (
-    accumulate_along_rays,
-    pack_info,
-    render_weight_from_density,
-)
+from leco_plugin.samplers.packed import accumulate_along_rays, pack_info, render_weight_from_density
 from leco_plugin.space import Space
 
 VISIBLE = 1e-4

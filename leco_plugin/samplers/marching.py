@@ -42,10 +42,7 @@ RUN = 1 << RUN_BITS
 
 @torch.no_grad()
 def march(
-    rays: Rays,
-    rule: March,
-    occupied: OccupiedFn | None = None,
-    near_occupied: NearFn | None = None,
+    rays: Rays, rule: March, occupied: OccupiedFn | None = None, near_occupied: NearFn | None = None
 ) -> Samples:
     """Candidates along rays, without those that `occupied` denies.
 

@@ -148,11 +148,7 @@ def _more_and_more_cautious(
 
 
 def _largest_tables(
-    occupancy: OccupancyLike,
-    budget: int,
-    enough: float,
-    margin: float,
-    seen: Look | None,
+    occupancy: OccupancyLike, budget: int, enough: float, margin: float, seen: Look | None
 ) -> tuple[int, Tables, Tensor] | None:
     """The finest tables within the budget that are of use.
 

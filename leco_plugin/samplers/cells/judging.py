@@ -13,14 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate, max_pool3d, pad
 
-from leco_plugin.samplers.cells.cache import (
-    BRICK,
-    EMPTY,
-    FARTHEST,
-    MIXED,
-    OCCUPIED,
-    OccupancyLike,
-)
+from leco_plugin.samplers.cells.cache import BRICK, EMPTY, FARTHEST, MIXED, OCCUPIED, OccupancyLike
 
 LEAST_O = 1e-7
 """Of o and of 1 - o, where they are taken to logits."""

@@ -24,11 +24,7 @@ from leco_plugin.samplers.cells.cache import (
 from leco_plugin.samplers.kernels.gate_kernel import gate_keeps, largest_of, map_position
 from leco_plugin.samplers.kernels.gate_weights import GateWeights
 from leco_plugin.samplers.marching import Samples
-from leco_plugin.samplers.rays import (
-    MAX_CANDIDATES_PER_RAY,
-    Candidates,
-    check_longest,
-)
+from leco_plugin.samplers.rays import MAX_CANDIDATES_PER_RAY, Candidates, check_longest
 
 STEPS = 32
 """Candidates that a program works on at once: one coarse question for all of them, and the gate's
@@ -62,15 +58,7 @@ def _clamp(cell, RESOLUTION: tl.constexpr):
 
 @triton.jit
 def cells_near(
-    x,
-    y,
-    z,
-    radius,
-    facts,
-    frame,
-    clearance,
-    RESOLUTION: tl.constexpr,
-    CONTRACTED: tl.constexpr,
+    x, y, z, radius, facts, frame, clearance, RESOLUTION: tl.constexpr, CONTRACTED: tl.constexpr
 ):
     """`CellCache.near` of one cube."""
     u, v, w = _cells(x, y, z, facts, frame, RESOLUTION, CONTRACTED)
