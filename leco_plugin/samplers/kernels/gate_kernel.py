@@ -146,14 +146,9 @@ def _halves(features, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
 
 @triton.jit
 def _layer(
-    features,
-    matrices,
-    sums,
-    ROWS: tl.constexpr,
-    IN: tl.constexpr,
-    OUT: tl.constexpr,
-    HALF: tl.constexpr,
-):
+    features, matrices, sums,
+    ROWS: tl.constexpr, IN: tl.constexpr, OUT: tl.constexpr, HALF: tl.constexpr,
+):  # fmt: skip
     """sums + features [ROWS, IN] times a matrix [IN, OUT], 64 rows of which are held at a time."""
     if IN == 256:
         low, high = _halves(features, ROWS, IN)
@@ -164,14 +159,9 @@ def _layer(
 
 @triton.jit
 def _half_layer(
-    features,
-    matrices,
-    sums,
-    ROWS: tl.constexpr,
-    IN: tl.constexpr,
-    OUT: tl.constexpr,
-    HALF: tl.constexpr,
-):
+    features, matrices, sums,
+    ROWS: tl.constexpr, IN: tl.constexpr, OUT: tl.constexpr, HALF: tl.constexpr,
+):  # fmt: skip
     if IN == 128:
         low, high = _halves(features, ROWS, IN)
         sums = _multiply(low, _load(matrices, IN // 2, OUT), sums, HALF)
@@ -197,24 +187,11 @@ def _norm(hidden, epsilon, WIDTH: tl.constexpr, PADDED_WIDTH: tl.constexpr):
 
 @triton.jit
 def gate_keeps(
-    x,
-    y,
-    z,
-    facts,
-    matrices,
-    vectors,
-    seen,
-    ROWS: tl.constexpr,
-    OCTAVES: tl.constexpr,
-    COLUMNS: tl.constexpr,
-    WIDTH: tl.constexpr,
-    PADDED_WIDTH: tl.constexpr,
-    LAYERS: tl.constexpr,
-    LOGITS: tl.constexpr,
-    PADDED_LOGITS: tl.constexpr,
-    CONTRACTED: tl.constexpr,
-    HALF: tl.constexpr,
-):
+    x, y, z, facts, matrices, vectors, seen,
+    ROWS: tl.constexpr, OCTAVES: tl.constexpr, COLUMNS: tl.constexpr, WIDTH: tl.constexpr,
+    PADDED_WIDTH: tl.constexpr, LAYERS: tl.constexpr, LOGITS: tl.constexpr,
+    PADDED_LOGITS: tl.constexpr, CONTRACTED: tl.constexpr, HALF: tl.constexpr,
+):  # fmt: skip
     """The gate's decisions about positions [ROWS]."""
     u, v, w, inside = map_position(x, y, z, facts, CONTRACTED)
     u, v, w = tl.where(inside, u, 0.0), tl.where(inside, v, 0.0), tl.where(inside, w, 0.0)
@@ -263,26 +240,11 @@ def _occupancy(logits, number, LOGITS: tl.constexpr):
 
 @triton.jit(do_not_specialize=["count", "column_stride"])  # else a compilation for every kind
 def _gate_kernel(
-    positions,
-    kept,
-    count,
-    row_stride,
-    column_stride,
-    facts,
-    matrices,
-    vectors,
-    seen,
-    ROWS: tl.constexpr,
-    OCTAVES: tl.constexpr,
-    COLUMNS: tl.constexpr,
-    WIDTH: tl.constexpr,
-    PADDED_WIDTH: tl.constexpr,
-    LAYERS: tl.constexpr,
-    LOGITS: tl.constexpr,
-    PADDED_LOGITS: tl.constexpr,
-    CONTRACTED: tl.constexpr,
-    HALF: tl.constexpr,
-):
+    positions, kept, count, row_stride, column_stride, facts, matrices, vectors, seen,
+    ROWS: tl.constexpr, OCTAVES: tl.constexpr, COLUMNS: tl.constexpr, WIDTH: tl.constexpr,
+    PADDED_WIDTH: tl.constexpr, LAYERS: tl.constexpr, LOGITS: tl.constexpr,
+    PADDED_LOGITS: tl.constexpr, CONTRACTED: tl.constexpr, HALF: tl.constexpr,
+):  # fmt: skip
     rows = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     there = rows < count
     column_stride = column_stride.to(tl.int64)  # twice it is a billion positions' worth
@@ -291,24 +253,9 @@ def _gate_kernel(
     y = tl.load(at + column_stride, mask=there, other=0.0)
     z = tl.load(at + 2 * column_stride, mask=there, other=0.0)
     keep = gate_keeps(
-        x,
-        y,
-        z,
-        facts,
-        matrices,
-        vectors,
-        seen,
-        ROWS,
-        OCTAVES,
-        COLUMNS,
-        WIDTH,
-        PADDED_WIDTH,
-        LAYERS,
-        LOGITS,
-        PADDED_LOGITS,
-        CONTRACTED,
-        HALF,
-    )
+        x, y, z, facts, matrices, vectors, seen, ROWS, OCTAVES, COLUMNS, WIDTH, PADDED_WIDTH,
+        LAYERS, LOGITS, PADDED_LOGITS, CONTRACTED, HALF,
+    )  # fmt: skip
     tl.store(kept + rows, keep.to(tl.uint8), mask=there)
 
 

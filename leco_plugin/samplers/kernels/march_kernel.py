@@ -83,20 +83,9 @@ def cells_near(
 
 @triton.jit
 def cells_decide(
-    x,
-    y,
-    z,
-    wanted,
-    facts,
-    frame,
-    coarse,
-    fine,
-    first_plane,
-    planes,
-    n_planes,
-    RESOLUTION: tl.constexpr,
-    CONTRACTED: tl.constexpr,
-):
+    x, y, z, wanted, facts, frame, coarse, fine, first_plane, planes, n_planes,
+    RESOLUTION: tl.constexpr, CONTRACTED: tl.constexpr,
+):  # fmt: skip
     """`CellCache.decide`: which of the wanted positions are occupied, and which are left open."""
     u, v, w = _cells(x, y, z, facts, frame, RESOLUTION, CONTRACTED)
     i, j, k = tl.floor(u), tl.floor(v), tl.floor(w)
@@ -143,41 +132,12 @@ def _three_rows(rows, n_rays, ray):
 
 @triton.jit(do_not_specialize=["n_rays", "n_planes"])
 def _march_kernel(
-    rays,
-    n_rays,
-    numbers,
-    growth,
-    step_size,
-    starts,
-    ends,
-    found,
-    ray_indices,
-    t_starts,
-    t_ends,
-    coarse,
-    fine,
-    first_plane,
-    planes,
-    n_planes,
-    clearance,
-    frame,
-    facts,
-    matrices,
-    vectors,
-    seen,
-    STEPS: tl.constexpr,
-    CONED: tl.constexpr,
-    RESOLUTION: tl.constexpr,
-    OCTAVES: tl.constexpr,
-    COLUMNS: tl.constexpr,
-    WIDTH: tl.constexpr,
-    PADDED_WIDTH: tl.constexpr,
-    LAYERS: tl.constexpr,
-    LOGITS: tl.constexpr,
-    PADDED_LOGITS: tl.constexpr,
-    CONTRACTED: tl.constexpr,
-    HALF: tl.constexpr,
-):
+    rays, n_rays, numbers, growth, step_size, starts, ends, found, ray_indices, t_starts, t_ends,
+    coarse, fine, first_plane, planes, n_planes, clearance, frame, facts, matrices, vectors, seen,
+    STEPS: tl.constexpr, CONED: tl.constexpr, RESOLUTION: tl.constexpr, OCTAVES: tl.constexpr,
+    COLUMNS: tl.constexpr, WIDTH: tl.constexpr, PADDED_WIDTH: tl.constexpr, LAYERS: tl.constexpr,
+    LOGITS: tl.constexpr, PADDED_LOGITS: tl.constexpr, CONTRACTED: tl.constexpr, HALF: tl.constexpr,
+):  # fmt: skip
     ray = tl.program_id(0)
     n_rays = n_rays.to(tl.int64)  # six rows of them are read
     ox, oy, oz = _three_rows(rays, n_rays, ray)
@@ -209,41 +169,15 @@ def _march_kernel(
             middles = (t_start + t_end) * 0.5
             x, y, z = tl.fma(dx, middles, ox), tl.fma(dy, middles, oy), tl.fma(dz, middles, oz)
             kept, left_open = cells_decide(
-                x,
-                y,
-                z,
-                wanted,
-                facts,
-                frame,
-                coarse,
-                fine,
-                first_plane,
-                planes,
-                n_planes,
-                RESOLUTION,
-                CONTRACTED,
-            )
+                x, y, z, wanted, facts, frame, coarse, fine, first_plane, planes, n_planes,
+                RESOLUTION, CONTRACTED,
+            )  # fmt: skip
             kept = tl.where(wanted & kept, 1, 0)
             if tl.max(left_open.to(tl.int32), axis=0) > 0:
                 by_gate = gate_keeps(
-                    x,
-                    y,
-                    z,
-                    facts,
-                    matrices,
-                    vectors,
-                    seen,
-                    STEPS,
-                    OCTAVES,
-                    COLUMNS,
-                    WIDTH,
-                    PADDED_WIDTH,
-                    LAYERS,
-                    LOGITS,
-                    PADDED_LOGITS,
-                    CONTRACTED,
-                    HALF,
-                )
+                    x, y, z, facts, matrices, vectors, seen, STEPS, OCTAVES, COLUMNS, WIDTH,
+                    PADDED_WIDTH, LAYERS, LOGITS, PADDED_LOGITS, CONTRACTED, HALF,
+                )  # fmt: skip
                 kept = tl.where(left_open, by_gate.to(tl.int32), kept)
             places = place + tl.cumsum(kept, axis=0) - kept
             written = tl.where(kept > 0, places, end) < end
