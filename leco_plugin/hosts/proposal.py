@@ -178,17 +178,9 @@ class LearnedOccupancySampler(_ProposalSampler):
 
 
 class DenseSampler(_ProposalSampler):
-    """As many samples as are asked for, laid along every ray as the host lays its first ones.
-
-    Args:
-        num_samples: of the host, after its proposals; not used.
-        samples: samples of each ray.
-        initial_sampler, single_jitter: as of `LearnedOccupancySampler`.
-        occupancy, frame: likewise; not used.
-
-    Raises:
-        ValueError: there is not even one sample.
-    """
+    """So many `samples`, at least one, laid along every ray as the host lays its first ones. What
+    else a host gives is as of `LearnedOccupancySampler`; its `num_samples`, an occupancy and a
+    frame are not used."""
 
     samples: int
 

@@ -253,14 +253,8 @@ def densities_of_samples(
 
 
 class DenseEstimator(Estimator):
-    """Keeps every candidate: the reference that skipping is measured against.
-
-    Args:
-        aabb: box (min, max) to which rays are clipped, [6]; None marches from near to far.
-
-    Raises:
-        ValueError: the box is empty or not finite.
-    """
+    """Keeps every candidate: the reference that skipping is measured against. Rays are clipped to a
+    box (min, max), [6], if there is one: ValueError if it is empty or not finite."""
 
     aabbs: Tensor
 

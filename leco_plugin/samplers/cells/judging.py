@@ -189,8 +189,7 @@ def fit_planes(
 def clearance_of(states: Tensor, mixed: Tensor, fine_states: Tensor) -> Tensor:
     """The clearance table, from the states of coarse [n, n, n] and fine [n_mixed, 64] cells."""
     half = BRICK // 2
-    taken = (states != EMPTY).repeat_interleave(2, 0).repeat_interleave(2, 1)
-    taken = taken.repeat_interleave(2, 2).float()
+    taken = interpolate((states != EMPTY).float()[None, None], scale_factor=2)[0, 0]
     bricks = (fine_states != EMPTY).float().view(-1, 1, BRICK, BRICK, BRICK)
     inner = max_pool3d(bricks, half)[:, 0] if len(bricks) else bricks[:, 0]
     for x, y, z in ((x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)):
