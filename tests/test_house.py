@@ -28,6 +28,7 @@ KNOWN: list[tuple[str, str]] = []
 
 MOST_LINES, MOST_LINES_OF_A_FUNCTION = 400, 60
 
+
 @cache
 def modules() -> dict[str, Path]:
     """All modules of the package, by their dotted names."""

@@ -219,15 +219,12 @@ def first_non_finite(losses: dict[str, Tensor]) -> str | None:
 def require_finite(
     losses: dict[str, Tensor], model: nn.Module, outputs: dict[str, Any], image: Tensor
 ) -> None:
-    """FloatingPointError, with the likely cause, for losses that are not finite: no step is taken.
-    `image` is what the batch was compared with; `rays` and `shaded` of its outputs, where they are
-    there, are suspects too."""
-    if name := first_non_finite(losses):
-        raise FloatingPointError(explain_non_finite(name, model, outputs, image))
-
-
-def explain_non_finite(name: str, model: nn.Module, outputs: dict[str, Any], image: Tensor) -> str:
-    """One line: which loss, and the first thing on its way that was not finite."""
+    """FloatingPointError for losses that are not finite, before a step is taken: which one, and the
+    likely cause, the first thing on its way that is not finite, in one line. `image` is what the
+    batch was compared with; `rays` and `shaded`, where outputs hold them, are suspects too."""
+    name = first_non_finite(losses)
+    if name is None:
+        return
     rays, shaded = outputs.get("rays"), outputs.get("shaded")
     suspects = [("the training image holds values that are not finite", image)]
     if rays is not None:
@@ -248,4 +245,4 @@ def explain_non_finite(name: str, model: nn.Module, outputs: dict[str, Any], ima
         (text for text, value in suspects if not bool(torch.isfinite(value).all())),
         "all inputs and parameters are finite; the loss itself overflowed",
     )
-    return f"{name} is not finite: {cause}."
+    raise FloatingPointError(f"{name} is not finite: {cause}.")
