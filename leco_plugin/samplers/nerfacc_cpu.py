@@ -36,8 +36,8 @@ _switches: list[tuple[Function, Function]] = []
 
 
 def install_for(device: torch.device | str | None) -> None:
-    """`install` for a model that is built for this device, unless that is CUDA; where None is
-    known, on machines without CUDA. ImportError as of `install`."""
+    """`install` for a model that is built for this device, unless that is CUDA; for None, which is
+    not known, on machines without CUDA. ImportError as of `install`."""
     if torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu")).type != "cuda":
         install()
 
