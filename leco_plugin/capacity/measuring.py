@@ -24,23 +24,12 @@ from leco_plugin.evaluation.clock import seconds_now
 from leco_plugin.evaluation.equal_loss import (
     kept_shares,
     mapped_box,
+    plain_and_dilated,
     reached_volume,
-    threshold_losing,
 )
-from leco_plugin.evaluation.field_grids import (
-    dilate,
-    fits_memory,
-    largest_in_cells,
-    look_up_scores,
-    octree_bytes,
-)
+from leco_plugin.evaluation.field_grids import fits_memory, largest_in_cells
 from leco_plugin.evaluation.inspection import ViewBox, in_parts
-from leco_plugin.evaluation.report import (
-    describe_code,
-    describe_machine,
-    made_by,
-    read_object,
-)
+from leco_plugin.evaluation.report import describe_code, describe_machine, made_by, read_object
 from leco_plugin.learning.sharpening import Lesson, lesson_from_field, teach
 from leco_plugin.log import bar, put
 from leco_plugin.models.gate import GateConfig, occupancy_logit
@@ -202,14 +191,11 @@ def _measure_grid(taught: Taught, candidate: Candidate, lost: float) -> dict[str
     assert candidate.resolution is not None
     box = mapped_box(taught.mixture)
     scores = taught_grid(taught.lesson, box, candidate.resolution)
-    both = []
-    for cells in (scores, dilate(scores)):
-        of_rays, of_volume = (
-            look_up_scores(cells, box, places) for places in (taught.mapped, taught.volume)
-        )
-        kept = cells >= threshold_losing(taught.held_out.worth, of_rays, lost)
-        found = measure(taught.held_out, of_rays, of_volume, lost)
-        both.append(found | {"octree_bytes": octree_bytes(kept)})
+    places = taught.mapped, taught.volume, taught.held_out.worth
+    both = [
+        measure(taught.held_out, *found, lost) | {"octree_bytes": size}
+        for *found, size in plain_and_dilated(scores, box, *places, lost)
+    ]
     return min(both, key=lambda one: one["kept_volume"])
 
 

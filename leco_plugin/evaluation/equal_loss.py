@@ -120,12 +120,7 @@ def at_equal_loss(
             else kept_by(in_parts(score, mapped), in_parts(score, volume))
             for name, score in (others or {}).items()
         }
-        rows, left_out = [], []
-        for row, scores in _grids_of(mixture, grids, taught, mapped, weights):
-            if scores is None:
-                left_out.append(row["resolution"])
-                continue
-            rows.append(row | of_grid(scores))
+        rows, left_out = _kept_by_grids(mixture, grids, taught, mapped, weights, of_grid)
     return {
         "lost_surface_mass": LOST_SURFACE_MASS,
         "reached_volume": round(len(volume) / VOLUME_POINTS, 5),
@@ -151,32 +146,42 @@ def near_points(points: Tensor) -> Callable[[Tensor], Tensor]:
     return score
 
 
+def plain_and_dilated(
+    scores: Tensor, box: ViewBox, mapped: Tensor, volume: Tensor, weights: Tensor, lost: float
+) -> Iterator[tuple[Tensor, Tensor, int]]:
+    """A grid of scores [n, n, n] as it is, then dilated by a cell: its scores of candidates [M, 3]
+    and of places `volume` [P, 3], and its octree's bytes where a share of the weights [M] is lost.
+    """
+    for cells in (scores, dilate(scores)):
+        of_rays, of_volume = (look_up_scores(cells, box, places) for places in (mapped, volume))
+        yield of_rays, of_volume, octree_bytes(cells >= threshold_losing(weights, of_rays, lost))
+
+
 def _kept_by_grid(
     weights: Tensor, box: ViewBox, mapped: Tensor, volume: Tensor, scores: Tensor
 ) -> dict[str, Any]:
-    """What a grid of scores [n, n, n] keeps, as it is or dilated, whichever keeps less; and its
-    bytes as an octree."""
-    both = []
-    for dilated, cells in enumerate((scores, dilate(scores))):
-        of_rays, of_volume = (look_up_scores(cells, box, places) for places in (mapped, volume))
-        found = {"dilated": bool(dilated), **_kept_by(weights, of_rays, of_volume)}
-        kept = cells >= threshold_losing(weights, of_rays, LOST_SURFACE_MASS)
-        both.append(found | {"octree_bytes": octree_bytes(kept)})
-    return min(both, key=lambda one: one["kept_reached_volume"])
+    """What a grid of scores [n, n, n] keeps, as it is or dilated, whichever keeps less."""
+    both = plain_and_dilated(scores, box, mapped, volume, weights, LOST_SURFACE_MASS)
+    rows = [
+        {"dilated": bool(dilated), **_kept_by(weights, *found), "octree_bytes": size}
+        for dilated, (*found, size) in enumerate(both)
+    ]
+    return min(rows, key=lambda one: one["kept_reached_volume"])
 
 
-def _grids_of(
+def _kept_by_grids(
     mixture: Mixture,
     resolutions: Sequence[int],
     taught: Tensor,
     mapped: Tensor,
     weights: Tensor,
-) -> Iterator[tuple[dict[str, Any], Tensor | None]]:
-    """Facts and scores [n, n, n] of grids of the field, which hold its density at the mapped places
-    `taught` [M, 3] too. There are no scores where there is no memory or no time for them."""
+    of_grid: Callable[[Tensor], dict[str, Any]],
+) -> tuple[list[dict[str, Any]], list[int]]:
+    """Facts of grids of the field, which hold its density at the mapped places `taught` [M, 3] too;
+    and the resolutions for which there is no memory or no time."""
     if not resolutions:
-        return
-    box = mapped_box(mixture)
+        return [], []
+    rows, left_out, box = [], [], mapped_box(mixture)
 
     def floor_of(scores: Tensor) -> float:
         of_rays = look_up_scores(scores, box, mapped)
@@ -185,10 +190,15 @@ def _grids_of(
     most = MOST_ON_CPU if mixture.device.type == "cpu" else math.inf
     known = taught, density_of(mixture, taught)
     filling = FieldGrids(partial(density_of, mixture), box, known, floor_of, most)
-    for resolution in resolutions:
-        scores = filling.fill(resolution) if fits_memory(resolution**3) else None
-        row = {"resolution": resolution, "bytes": math.ceil(resolution**3 / 8)}
-        yield row | {"update_seconds": round(filling.clock.seconds, 3)}, scores
+    for n in resolutions:
+        scores = filling.fill(n) if fits_memory(n**3) else None
+        if scores is None:
+            left_out.append(n)
+            continue
+        row = {"resolution": n, "bytes": math.ceil(n**3 / 8)}
+        row["update_seconds"] = round(filling.clock.seconds, 3)
+        rows.append(row | of_grid(scores))
+    return rows, left_out
 
 
 def _measured(
