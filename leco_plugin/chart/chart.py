@@ -156,33 +156,34 @@ class Chart:
         there = f" ({more})" if stored else ""
         return f"{runs}{beside}, {about}{there}"
 
-    def failures(self) -> list[dict[str, Any]]:
-        """Runs that ended without a result, by seed, and whether this call asked for them. Those of
-        earlier settings under the same name are left out, as in `results`."""
+    def _name_of(self, made: Contender) -> str | None:
+        """How a stored contender is called here. None for settings of an earlier version under a
+        name of this call: a mean of both says nothing."""
         names = {one.key: one.name for one in self.contenders}
+        return names.get(made.key, None if made.name in names.values() else made.name)
+
+    def failures(self) -> list[dict[str, Any]]:
+        """Runs that ended without a result, by seed, and whether this call asked for them."""
         asked, found = {(job.contender.key, job.seed) for job in self.jobs}, []
         for one in self.folder.failures():
-            key = Contender.from_dict(one["contender"]).key
-            row = {name: one["contender"][name] for name in ("name", "method", "sampler")}
-            row |= {name: one[name] for name in ("seed", "reason")}
-            if key in names or row["name"] not in names.values():
-                row["name"] = names.get(key, row["name"])
-                found.append({**row, "asked": (key, row["seed"]) in asked})
+            made = Contender.from_dict(one["contender"])
+            if (name := self._name_of(made)) is not None:
+                row = {"name": name, "method": made.method, "sampler": made.sampler}
+                row |= {"seed": one["seed"], "reason": one["reason"]}
+                found.append({**row, "asked": (made.key, one["seed"]) in asked})
         return sorted(found, key=lambda one: (one["seed"], one["name"]))
 
     def results(self) -> dict[str, Any]:
         """All finished runs in the folder, the contenders of this call first."""
-        names = {one.key: one.name for one in self.contenders}
-        places = {key: place for place, key in enumerate(names)}
+        places = {one.key: place for place, one in enumerate(self.contenders)}
         stored, runs = {}, []
         for file, record in self.folder.stored().items():
             made = Contender.from_dict(record["contender"])
-            # settings of an earlier version under the same name: a mean of both says nothing
-            if made.key not in names and made.name in names.values():
+            if (name := self._name_of(made)) is None:
                 continue
             stored[file] = record
             code = record["made"].get("sources") or record["made"].get("commit")
-            run = {**record["run"], "name": names.get(made.key, made.name), "code": code}
+            run = {**record["run"], "name": name, "code": code}
             runs.append(((places.get(made.key, len(places)), made.key, run["seed"]), run))
         in_order = [run for _, run in sorted(runs, key=lambda one: one[0])]
         failures = self.failures()
