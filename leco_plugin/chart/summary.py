@@ -6,6 +6,7 @@ import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import eq
 from typing import Any, Literal
 
 import numpy as np
@@ -339,8 +340,8 @@ class Versus:
     """The other's median training time as a multiple of those seconds."""
     faster: tuple[float, ...]
     """The other's median time to render an image as a multiple of its own."""
-    first: tuple[float, ...]
-    """Seconds of the first evaluation: a run that passes there may have passed before."""
+    at_first: tuple[bool, ...]
+    """Whether each run passed by its first evaluation, and perhaps before."""
 
 
 def versus(ours: Line, theirs: Line, seconds: float | None) -> Versus:
@@ -354,7 +355,8 @@ def versus(ours: Line, theirs: Line, seconds: float | None) -> Versus:
     sooner = tuple(None if after is None else ended / after for after in passed)
     faster = tuple(rendered / run[RENDERING.key] for run in ours.runs)
     psnr = compare(ours.psnrs, theirs.psnrs)
-    return Versus(ours.name, theirs.name, psnr, passed, sooner, faster, ours.first_evaluations)
+    at_first = tuple(map(eq, passed, ours.first_evaluations))
+    return Versus(ours.name, theirs.name, psnr, passed, sooner, faster, at_first)
 
 
 def rivals(lines: Sequence[Line], seconds: float | None = None) -> list[Versus]:

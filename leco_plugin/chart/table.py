@@ -189,11 +189,6 @@ def _seconds_to(psnr: float, line: Line) -> str:
     return _marked(said, statistics.median_low(known), bounds, "≤")
 
 
-def at_first(passed: Sequence[float | None], first: Sequence[float]) -> list[bool]:
-    """Whether each run passed by its first evaluation, and perhaps before."""
-    return [after == seconds for after, seconds in zip(passed, first)]
-
-
 def bounded_spread(
     values: Sequence[float | None], form: str, is_bound: Sequence[bool], sign: str
 ) -> str:
@@ -229,11 +224,9 @@ def versus_table(duels: Sequence[Versus]) -> str:
             "against": lambda duel: f"{duel.ours} against {duel.theirs}",
             "PSNR": lambda duel: duel.psnr.said(),
             "passes its last PSNR after, s": lambda duel: bounded_spread(
-                duel.passed, ".0f", at_first(duel.passed, duel.first), "≤"
+                duel.passed, ".0f", duel.at_first, "≤"
             ),
-            "sooner by, x": lambda duel: bounded_spread(
-                duel.sooner, ".2f", at_first(duel.passed, duel.first), "≥"
-            ),
+            "sooner by, x": lambda duel: bounded_spread(duel.sooner, ".2f", duel.at_first, "≥"),
             "renders faster by, x": lambda duel: spread(duel.faster, ".1f"),
         },
     )
@@ -247,14 +240,8 @@ def queries_table(lines: Sequence[Line]) -> str:
 
 
 def failures_table(failures: Sequence[Mapping[str, Any]]) -> str:
-    return table_of(
-        failures,
-        {
-            "method": lambda one: one["name"],
-            "seed": lambda one: str(one["seed"]),
-            "reason": lambda one: "failed: " + one["reason"],
-        },
-    )
+    cells = [[one["name"], str(one["seed"]), f"failed: {one['reason']}"] for one in failures]
+    return rows(["method", "seed", "reason"], cells)
 
 
 def occupancy_table(learned: Sequence[Learned]) -> str:
@@ -310,11 +297,15 @@ def left_out(lines: Sequence[Line]) -> list[str]:
     return said
 
 
+def made_in_words(made: Mapping[str, Any]) -> str:
+    """By which command, when and by which code results were made."""
+    commit = f" at {made['commit']}" if made["commit"] else ""
+    return f"`{made['command']}`, {made['date']}, leco_plugin {made['version']}{commit}."
+
+
 def provenance(results: Mapping[str, Any]) -> str:
     """When, how and by which code the runs were made, and whether it was the same for all."""
-    made, runs = results["made"], results["runs"]
-    commit = f" at {made['commit']}" if made["commit"] else ""
-    said = f"`{made['command']}`, {made['date']}, leco_plugin {made['version']}{commit}."
+    said, runs = made_in_words(results["made"]), results["runs"]
     spent = [run.get("wall_seconds") for run in runs]
     if all(spent) and (minutes := sum(spent) / 60.0):
         at_once = results["protocol"].get("at_once", 1)

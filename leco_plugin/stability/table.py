@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 from leco_plugin.chart.summary import sentence
-from leco_plugin.chart.table import rows
+from leco_plugin.chart.table import made_in_words, rows
 from leco_plugin.chart.theme import LIGHT, Theme, new_figure, save_picture, save_whole
 from leco_plugin.log import counted
 from leco_plugin.stability.plan import LEARNED, QUICK
@@ -58,12 +58,10 @@ Results = Mapping[str, Any]
 
 def table(results: Results) -> str:
     """The whole of `table.md`."""
-    made = results["made"]
     reasons = [[row["title"], row["why"]] for row in results["cases"]]
     parts = ["# Stability", headline(results), verdicts(results), failures(results)]
     parts.append(rows(["case", "why it is there"], reasons))
-    commit = f" at {made['commit']}" if made["commit"] else ""
-    parts.append(f"`{made['command']}`, {made['date']}, leco_plugin {made['version']}{commit}.")
+    parts.append(made_in_words(results["made"]))
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
