@@ -1,21 +1,35 @@
-"""Claims about comparing representations where all lose equally much."""
+"""Claims about occupancies where all lose equally much, and beside the exact city."""
 
 from __future__ import annotations
+
+from types import SimpleNamespace
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from nerfstudio.cameras.cameras import Cameras
 from small_learner import SMALLEST, small_mixture
 from torch import Tensor
 
 from leco_plugin.evaluation import equal_loss
-from leco_plugin.evaluation.equal_loss import at_equal_loss, kept_shares, threshold_losing
+from leco_plugin.evaluation.equal_loss import (
+    CELLS,
+    at_equal_loss,
+    compare_with_truth,
+    free_points,
+    is_reached,
+    kept_shares,
+    rays_of_photographs,
+    threshold_losing,
+)
 from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.dense import Reference
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.rendering import Intervals, Rays
 from leco_plugin.scenes.bounds import SceneBounds
+from leco_plugin.scenes.city.city import CityConfig
+from leco_plugin.scenes.city.folder import CaptureConfig, CityTruth, write_city
 
 
 def slow_threshold(weights: Tensor, scores: Tensor, lost: float) -> float:
@@ -177,4 +191,113 @@ def test_a_grid_that_does_not_fit_the_memory_is_left_out(mixture: Mixture) -> No
 def test_training_draws_the_same_random_numbers_afterwards(mixture: Mixture) -> None:
     state = torch.random.get_rng_state()
     at_equal_loss(mixture, None, grids=(4,), config=FEW)
+    assert torch.equal(torch.random.get_rng_state(), state)
+
+
+SCALE, STEP, HIGHEST = 0.02, 0.01, 1.2
+NO_WALLS = torch.tensor([-1e6] * 3 + [1e6] * 3)
+
+
+@pytest.fixture(autouse=True)
+def few_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(equal_loss, "AIR_POINTS", 4000)
+    monkeypatch.setattr(equal_loss, "MOST_SURFACE_POINTS", 4000)
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> CityTruth:
+    folder = tmp_path_factory.mktemp("truth") / "city"
+    write_city(CityConfig(blocks=1), folder, CaptureConfig(48, 36), progress=False)
+    transform = torch.eye(4)[:3]
+    outputs = SimpleNamespace(dataparser_transform=transform, dataparser_scale=SCALE)
+    return CityTruth.from_dataparser(folder, outputs)
+
+
+class Rule:
+    """Keeps what a rule says, as an occupancy would."""
+
+    threshold_value = torch.tensor(0.5)
+
+    def __init__(self, rule) -> None:  # type: ignore[no-untyped-def]
+        self.occupied = rule
+
+
+def test_only_keeping_just_what_is_near_a_surface_is_perfect(truth: CityTruth) -> None:
+    for rule, recall, skipped in (
+        (lambda positions: truth.distance(positions) * truth.scale <= STEP, 1.0, 1.0),
+        (lambda positions: torch.ones(len(positions), dtype=torch.bool), 1.0, 0.0),
+        (lambda positions: torch.zeros(len(positions), dtype=torch.bool), 0.0, 1.0),
+    ):
+        found = compare_with_truth(Rule(rule), truth, NO_WALLS, STEP, HIGHEST)  # type: ignore
+        assert found == {"kept_surface_recall": recall, "free_space_skipped": skipped}
+
+
+def test_free_points_are_in_the_air_inside_the_walls(truth: CityTruth) -> None:
+    walls = torch.tensor([-0.3, -0.3, -1.0, 0.3, 0.3, 0.9])
+    points = free_points(truth, truth.visible_surface("test"), walls, STEP, HIGHEST)
+    assert len(points) > 1000 and not bool(truth.occupied(points).any())
+    assert float(points[:, 2].max()) <= 0.9 and float(points[:, :2].abs().max()) <= 0.3
+    assert float((truth.distance(points) * truth.scale).min()) > STEP
+
+
+def slow_reached(taught: Tensor, mapped: Tensor) -> list[bool]:
+    """Place by place: whether any taught one lies in the same cell of the cube."""
+
+    def cell(place: Tensor) -> tuple[int, ...]:
+        return tuple(min(int((float(x) + 1.0) / 2.0 * CELLS), CELLS - 1) for x in place)
+
+    known = {cell(place) for place in taught}
+    return [cell(place) in known for place in mapped]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_place_is_reached_where_a_taught_one_shares_its_cell(seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    taught = 0.1 * torch.rand(300, 3, generator=generator)
+    mapped = 0.1 * torch.rand(500, 3, generator=generator)
+    found = is_reached(taught, mapped)
+    assert found.tolist() == slow_reached(taught, mapped)
+    assert 0 < int(found.sum()) < 500
+
+
+def test_faces_of_the_cube_belong_to_it() -> None:
+    corners = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+    assert is_reached(corners, corners).all()
+    assert not is_reached(corners[:1], corners[1:]).any()
+    assert is_reached(corners[:1], corners[:1] + 1.0 / CELLS).all()
+
+
+def photographs() -> SimpleNamespace:
+    """A data manager with two cameras of different sizes at different places, both looking down."""
+    poses = torch.eye(4)[None, :3].repeat(2, 1, 1)
+    poses[1, 0, 3] = 5.0
+    cameras = Cameras(
+        poses,
+        fx=torch.tensor([[20.0], [20.0]]),
+        fy=torch.tensor([[20.0], [20.0]]),
+        cx=torch.tensor([[20.0], [5.0]]),
+        cy=torch.tensor([[10.0], [5.0]]),
+        width=torch.tensor([[40], [10]]),
+        height=torch.tensor([[20], [10]]),
+    )
+    return SimpleNamespace(train_dataset=SimpleNamespace(cameras=cameras))
+
+
+def test_rays_fill_the_photographs_and_stay_inside_them() -> None:
+    rays = rays_of_photographs(photographs(), 4000)
+    second = rays.origins[:, 0] > 1.0
+    assert 0.4 < float(second.float().mean()) < 0.6
+    slopes = rays.directions[:, :2] / -rays.directions[:, 2:]
+    for chosen, width, height in ((~second, 1.0, 0.5), (second, 0.25, 0.25)):
+        ends = torch.tensor([width, height])
+        assert bool((slopes[chosen].abs() <= ends + 1e-4).all())
+        assert bool((slopes[chosen].amax(dim=0) > 0.95 * ends).all())
+        assert bool((slopes[chosen].amin(dim=0) < -0.95 * ends).all())
+
+
+def test_rays_are_the_same_each_time_and_use_no_random_numbers_of_training() -> None:
+    state = torch.random.get_rng_state()
+    first, again = (rays_of_photographs(photographs(), 50) for _ in range(2))
+    torch.testing.assert_close(first.directions, again.directions)
+    assert not torch.equal(first.directions, rays_of_photographs(photographs(), 50, 1).directions)
     assert torch.equal(torch.random.get_rng_state(), state)
