@@ -246,12 +246,10 @@ def bad_inputs(folder: Path, file: Path) -> dict[str, list[object]]:
 
 
 def test_bad_input_ends_with_one_line_and_status_2(
-    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    file: Path, tmp_path: Path, refused: Any
 ) -> None:
-    for what, arguments in bad_inputs(tmp_path, file).items():
-        assert run(*arguments) == 2, what
-        said = capsys.readouterr().err
-        assert said.startswith("leco: ") and said.count("\n") == 1, (what, said)
+    for arguments in bad_inputs(tmp_path, file).values():
+        refused(*arguments)
 
 
 @pytest.mark.parametrize(
@@ -298,15 +296,14 @@ def test_a_place_that_cannot_be_written_to_is_named_before_anything_is_read_or_w
     ],
 )
 def test_no_command_writes_over_what_it_reads_or_over_what_it_has_just_written(
-    command: list[str], here: Path, capsys: pytest.CaptureFixture[str]
+    command: list[str], here: Path, refused: Any
 ) -> None:
     file = here / "run" / "occupancy.safetensors"
     file.parent.mkdir()
     ball().save(file)
     places = {"file": file, "folder": here, "scene": here / "transforms.json"}
     before, arguments = file.read_bytes(), [part.format(**places) for part in command]
-    assert run(*arguments) == 2
-    assert f"leco: {command[-2]} {arguments[-1]} is a file that" in capsys.readouterr().err
+    assert f"leco: {command[-2]} {arguments[-1]} is a file that" in refused(*arguments)
     assert file.read_bytes() == before and not (here / "x.ply").exists()
 
 
@@ -333,19 +330,18 @@ def test_a_place_that_takes_no_new_file_is_named_before_the_work(
 
 
 def test_a_page_that_cannot_be_written_beside_its_picture_is_named_before_the_work(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, refused: Any
 ) -> None:
     (tmp_path / "x.html").mkdir()
-    assert run("inspect", tmp_path / "none.safetensors", "--picture", tmp_path / "x.png") == 2
-    assert capsys.readouterr().err.endswith("x.html is a folder; give a file\n")
+    said = refused("inspect", tmp_path / "none.safetensors", "--picture", tmp_path / "x.png")
+    assert said.endswith("x.html is a folder; give a file\n")
 
 
 @pytest.mark.parametrize("option", ["--picture", "--history"])
 def test_a_kind_of_picture_that_cannot_be_drawn_is_named_before_the_file_is_read(
-    option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    option: str, tmp_path: Path, refused: Any
 ) -> None:
-    assert run("inspect", tmp_path / "none.safetensors", option, tmp_path / "new" / "x.foo") == 2
-    said = capsys.readouterr().err
+    said = refused("inspect", tmp_path / "none.safetensors", option, tmp_path / "new" / "x.foo")
     assert said.startswith(f"leco: {option} ") and "ends in none of" in said and "png" in said
     assert ("gif" in said) or option == "--picture"
     assert not list(tmp_path.iterdir())
@@ -359,7 +355,7 @@ def test_a_wrong_command_line_is_bad_input_too(arguments: list[str]) -> None:
 
 
 def test_a_misspelt_command_or_name_is_answered_with_the_one_that_it_resembles(
-    capsys: pytest.CaptureFixture[str],
+    capsys: pytest.CaptureFixture[str], refused: Any
 ) -> None:
     with pytest.raises(SystemExit) as end:
         run("pose", "photos")
@@ -373,8 +369,7 @@ def test_a_misspelt_command_or_name_is_answered_with_the_one_that_it_resembles(
         (["check", "occupancy-gird"], "occupancy-grid"),
         (["swap", "nerfacto", "--sampler", "Dense"], "dense"),
     ]:
-        assert run(*arguments) == 2
-        assert f"; did you mean {meant}? There are " in capsys.readouterr().err
+        assert f"; did you mean {meant}? There are " in refused(*arguments)
 
 
 def test_a_swap_whose_arguments_are_not_set_apart_says_how(

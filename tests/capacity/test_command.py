@@ -91,11 +91,10 @@ def test_what_was_finished_is_kept(
 
 @pytest.mark.usefixtures("taught")
 def test_other_settings_and_bad_input_are_refused_in_one_line(
-    tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tiny_scene: Path, tmp_path: Path, refused: Any
 ) -> None:
     out = tmp_path / "capacity"
     assert run("capacity", "--data", tiny_scene, "--out", out, "--grids", 16) == 0
-    capsys.readouterr()
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "thesis.txt").write_text("")
     new = ["--out", tmp_path / "new"]
@@ -112,9 +111,7 @@ def test_other_settings_and_bad_input_are_refused_in_one_line(
         "--grids has 1; a grid has 2 cells or more": ["--data", tiny_scene, *new, "--grids", 1],
     }
     for cause, arguments in cases.items():
-        assert run("capacity", *arguments) == 2, cause
-        said = capsys.readouterr().err
-        assert said.startswith("leco: ") and said.count("\n") == 1 and cause in said, said
+        assert cause in refused("capacity", *arguments)
     assert not (tmp_path / "new").exists()
 
 
@@ -122,15 +119,12 @@ def test_other_settings_and_bad_input_are_refused_in_one_line(
 @pytest.mark.parametrize("name", ["settings.json", "points/grid-16.json"])
 @pytest.mark.parametrize("text", ["{", "[]", '{"data": 1}'])
 def test_a_damaged_file_is_named(
-    tiny_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, text: str
+    tiny_scene: Path, tmp_path: Path, refused: Any, name: str, text: str
 ) -> None:
     arguments = ["capacity", "--data", tiny_scene, "--out", tmp_path / "out", "--grids", 16]
     assert run(*arguments) == 0
-    capsys.readouterr()
     (tmp_path / "out" / name).write_text(text)
-    assert run(*arguments) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("leco: ") and said.count("\n") == 1
+    refused(*arguments)
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -68,13 +68,12 @@ def test_a_portion_is_made_and_the_same_command_goes_on(
 
 
 def test_a_second_process_in_the_same_folder_is_refused_in_one_line(
-    tmp_path: Path, runs: Runs, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, runs: Runs, refused: Any
 ) -> None:
     words = ("--cases", "yard", "--samplers", "grid-128")
     with alone_in(tmp_path / "out", "table"):
-        assert stability(tmp_path / "out", *words) == 2
-    error = capsys.readouterr().err
-    assert "another process makes the table" in error and error.count("\n") == 1
+        error = refused("stability", "--out", tmp_path / "out", "--quick", *words)
+    assert "another process makes the table" in error
     assert not runs.made and stability(tmp_path / "out", *words) == 0
 
 
@@ -86,11 +85,9 @@ def test_a_second_process_in_the_same_folder_is_refused_in_one_line(
     ],
 )
 def test_an_unknown_name_is_one_line_and_starts_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], said: str
+    tmp_path: Path, refused: Any, words: tuple[str, ...], said: str
 ) -> None:
-    assert stability(tmp_path / "out", *words) == 2
-    error = capsys.readouterr().err
-    assert said in error and error.count("\n") == 1
+    assert said in refused("stability", "--out", tmp_path / "out", "--quick", *words)
     assert not (tmp_path / "out").exists()
 
 
