@@ -53,7 +53,6 @@ SOLID = 0.75
 def draw(
     occupancy: Occupancy,
     path: str | Path,
-    cameras: Tensor | None = None,
     colours: SceneColours | None = None,
     theme: Theme = LIGHT,
 ) -> Path:
@@ -61,20 +60,17 @@ def draw(
 
     Args:
         path: its ending chooses the kind of the picture.
-        cameras: [C, 3] camera centres, scene units; those of the report by default.
         colours: of the scene, drawn under the horizontal slices; None leaves them out.
         theme: of the page that shows it.
     Raises:
         OSError, ValueError: the picture cannot be written there, or is of no known kind.
     """
     with themed(theme, TYPE):
-        return save_whole(_figure(occupancy, cameras, colours, theme), Path(path), dpi=DPI)
+        return save_whole(_figure(occupancy, colours, theme), Path(path), dpi=DPI)
 
 
-def _figure(
-    occupancy: Occupancy, cameras: Tensor | None, colours: SceneColours | None, theme: Theme
-) -> Any:
-    cameras = cameras_of(occupancy) if cameras is None else cameras.detach().cpu().float()
+def _figure(occupancy: Occupancy, colours: SceneColours | None, theme: Theme) -> Any:
+    cameras = cameras_of(occupancy)
     box = interesting_box(occupancy, cameras)
     low, high = heights_seen_from_above(occupancy, box)
     points, normals = surface_points(occupancy, box, low)
