@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import datetime
 import math
-import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -20,12 +19,11 @@ from leco_plugin.chart.picture import draw_curves, name_ends
 from leco_plugin.chart.summary import Line
 from leco_plugin.chart.theme import LIGHT, new_figure, save_picture, save_whole, style, themed
 from leco_plugin.evaluation.clock import Budget, forget_peaks
-from leco_plugin.evaluation.equal_loss import occupancy_facts, truth_of
+from leco_plugin.evaluation.equal_loss import take_occupancy
 from leco_plugin.evaluation.inspection import ViewBox
 from leco_plugin.evaluation.occupancy_picture import draw_slice
 from leco_plugin.evaluation.report import describe_code, describe_cores, describe_machine
 from leco_plugin.evaluation.timed_run import TimedRun, timed_run
-from leco_plugin.learning.freezing import FILE_NAME
 from leco_plugin.log import bar
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.occupancy import Occupancy
@@ -82,9 +80,15 @@ def run_demo(
         guided_run, trainer = run_with_peaks(
             guided, budget, sampler="learned-occupancy", on_progress=show
         )
-    occupancy, facts, truth = _frozen_occupancy(trainer, folder, out)
-    _draw_picture(trainer, occupancy, truth, out / "picture.png")
     learned: Any = trainer.pipeline.model
+    left = take_occupancy(trainer, folder, out) if bool(learned.mixture.frozen) else None
+    if left is None:
+        raise RuntimeError(
+            "the time was over before the occupancy was learned: give more with --seconds"
+        )
+    occupancy, facts, truth = left
+    assert truth is not None
+    _draw_picture(trainer, occupancy, truth, out / "picture.png")
     other = never_frozen(guided, learned.progress.learn_steps)
     del trainer, learned
 
@@ -181,25 +185,6 @@ def _config(folder: Path, out: Path, seconds: float) -> TrainerConfig:
     steps = max(FEWEST_LEARN_STEPS, round(share * schedule.learn_steps))
     pipeline.model.schedule = replace(schedule, learn_steps=steps)
     return config
-
-
-def _frozen_occupancy(
-    trainer: Trainer, folder: Path, out: Path
-) -> tuple[Occupancy, dict[str, Any], CityTruth]:
-    """The occupancy that the run left, what is known and measured of it, and the exact city."""
-    model: Any = trainer.pipeline.model
-    written = trainer.base_dir / FILE_NAME
-    if not bool(model.mixture.frozen) or not written.exists():
-        raise RuntimeError(
-            "the time was over before the occupancy was learned: give more with --seconds"
-        )
-    kept_file = out / FILE_NAME
-    shutil.copyfile(written, kept_file)
-    occupancy = Occupancy.load(kept_file, model.device)
-    manager = trainer.pipeline.datamanager
-    truth = truth_of(folder, manager)
-    assert truth is not None
-    return occupancy, occupancy_facts(occupancy, kept_file, manager, truth), truth
 
 
 @torch.no_grad()

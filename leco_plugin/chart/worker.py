@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import shutil
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -70,8 +69,10 @@ def train_job(
     Returns:
         A run of `results.json`, with its `occupancy`, as JSON values; and the trainer.
     """
+    from leco_plugin.evaluation.equal_loss import take_occupancy
     from leco_plugin.evaluation.timed_run import timed_run
     from leco_plugin.models.leco import LecoModel
+    from leco_plugin.scenes.photographs import folder_of
 
     frozen: dict[str, Any] = {}
 
@@ -90,7 +91,8 @@ def train_job(
         on_progress=on_progress,
         on_frozen=when_frozen,
     )
-    facts = _occupancy_of(trainer, data, folder)
+    left = take_occupancy(trainer, folder_of(data), folder)
+    facts = None if left is None else left[1]
     if facts is not None:
         facts["at_equal_loss"] = _at_freezing(trainer, frozen, contender)
         facts["learn_seconds"] = run.learn_seconds
@@ -182,22 +184,6 @@ def compare_at_freezing(model: Any, datamanager: Any, contender: Contender) -> d
         row |= kept[row["name"]]
         row["bytes"] = row.pop("octree_bytes", row.get("bytes"))
     return found | rows
-
-
-def _occupancy_of(trainer: Trainer, data: Path, folder: Path) -> dict[str, Any] | None:
-    """Facts of the occupancy that a run has left, if any; its file is kept."""
-    from leco_plugin.evaluation.equal_loss import occupancy_facts, truth_of
-    from leco_plugin.learning.freezing import FILE_NAME
-    from leco_plugin.occupancy import Occupancy
-    from leco_plugin.scenes.photographs import folder_of
-
-    file = trainer.base_dir / FILE_NAME
-    if not file.exists():
-        return None
-    manager = trainer.pipeline.datamanager
-    shutil.copyfile(file, folder / FILE_NAME)
-    occupancy = Occupancy.load(file, trainer.pipeline.device)
-    return occupancy_facts(occupancy, file, manager, truth_of(folder_of(data), manager))
 
 
 def main(folder: Path, run: Make = run_job) -> int:

@@ -8,6 +8,7 @@ that rays of photographs reach is counted: elsewhere gates and grids are neither
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -31,6 +32,7 @@ from leco_plugin.evaluation.inspection import ViewBox, in_parts, whole_box
 from leco_plugin.evaluation.report import finite_or_null
 from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.dense import dense_reference, evaluating, in_chunks
+from leco_plugin.learning.freezing import FILE_NAME
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.rendering import backdrop_of, mapped_middles
 from leco_plugin.occupancy import CALIBRATED_AT, Occupancy
@@ -278,28 +280,32 @@ AIR_POINTS = 50_000
 """Positions drawn over the city; those in or near matter are then left out."""
 
 
-def truth_of(folder: Path, manager: Any) -> CityTruth | None:
-    """The exact scene in the coordinates of a data manager, where it is a city; None elsewhere."""
-    if not (folder / DESCRIPTION).is_file():
+def take_occupancy(
+    trainer: Any, scene: Path, out: Path
+) -> tuple[Occupancy, dict[str, Any], CityTruth | None] | None:
+    """Copies the occupancy that a run on a scene's folder has left to the folder `out`.
+
+    Returns:
+        None where the run left none. Otherwise the occupancy; its sizes, calibration, and the
+        comparison with the exact scene, JSON values; and that scene, None where it is no city.
+    """
+    file, manager = trainer.base_dir / FILE_NAME, trainer.pipeline.datamanager
+    if not file.exists():
         return None
-    return CityTruth.from_dataparser(folder, manager.train_dataparser_outputs)
-
-
-def occupancy_facts(
-    occupancy: Occupancy, file: Path, manager: Any, truth: CityTruth | None
-) -> dict[str, Any]:
-    """Sizes, calibration, and the comparison with the exact scene, which is None without one: JSON
-    values. The occupancy, of a file, and the truth are in the data manager's coordinates."""
+    shutil.copyfile(file, out / FILE_NAME)
+    occupancy, truth = Occupancy.load(file, trainer.pipeline.device), None
     report = occupancy.report
     measured: dict[str, Any] = {"kept_surface_recall": None, "free_space_skipped": None}
-    if truth is not None:
+    if (scene / DESCRIPTION).is_file():
+        truth = CityTruth.from_dataparser(scene, manager.train_dataparser_outputs)
         highest = float(manager.train_dataset.cameras.camera_to_worlds[:, 2, 3].max())
         box = torch.tensor(report["aabb"])
         measured = compare_with_truth(occupancy, truth, box, report["step_size"], highest)
     facts: dict[str, Any] = {"params": occupancy.num_params, "bytes": file.stat().st_size}
     for name in ("recoveries", CALIBRATED_AT):  # not every file says
         facts[name] = report.get(name)
-    return finite_or_null(facts | {name: report[name] for name in FROM_REPORT} | measured)
+    facts |= {name: report[name] for name in FROM_REPORT} | measured
+    return occupancy, finite_or_null(facts), truth
 
 
 def compare_with_truth(
