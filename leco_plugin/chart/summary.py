@@ -48,11 +48,11 @@ class Verdict:
         ours, theirs = self.seeds
         return f"{ours} seeds" if ours == theirs else f"{ours} and {theirs} seeds"
 
-    def said(self, unit: str = "dB") -> str:
+    def said(self) -> str:
         """The whole verdict, such as "ahead: +1.50 ± 0.42 dB, 3 seeds"."""
         word = f"{self.word}: " if self.word else ""
         margin = "" if self.margin is None else f" ± {self.margin:.2f}"
-        return f"{word}{self.difference:+.2f}{margin} {unit}, {self.by}"
+        return f"{word}{self.difference:+.2f}{margin} dB, {self.by}"
 
 
 def compare(ours: Sequence[float], theirs: Sequence[float], close: float | None = CLOSE) -> Verdict:

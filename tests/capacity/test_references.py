@@ -6,13 +6,42 @@ from dataclasses import replace
 
 import pytest
 import torch
-from valued_ball import ground
+from ball_occupancy import ball
 
 from leco_plugin.capacity.evidence import Evidence, loss, unlikely_at
-from leco_plugin.capacity.references import HOLDS, Bounds, Ground, Part, measure_original, verify
+from leco_plugin.capacity.references import (
+    HOLDS,
+    Bounds,
+    Ground,
+    Part,
+    Reference,
+    measure_original,
+    verify,
+)
 from leco_plugin.capacity.search import MARGIN, kept_of_box, lower_threshold
 from leco_plugin.learning.calibration import THRESHOLDS
 from leco_plugin.occupancy import Occupancy
+
+
+def everywhere(occupancy: Occupancy, seed: int) -> Evidence:
+    """Rays of two places of the ball's box, the second worth a hundredth of the first."""
+    generator = torch.Generator().manual_seed(seed)
+    positions = occupancy.space.unmap(2.0 * torch.rand(4000, 3, generator=generator) - 1.0)
+    kept = occupancy.occupied(positions)
+    worth = kept + 0.01 * ~kept
+    return Evidence(positions, torch.arange(4000) // 2, kept, worth, worth, 2000)
+
+
+def ground(*guided: bool) -> Ground:
+    """References that value the same places, whether or not the original guides them."""
+    known = ball()
+    known = Occupancy(known.gate, known.space, known.threshold).eval()
+    searched, unseen = (everywhere(known, seed) for seed in (1, 2))
+    sides = Part(searched), Part(unseen)
+    references = [
+        Reference("known", None, 1e-4 * each, 0.0, 0.0, *sides, guided=each) for each in guided
+    ]
+    return Ground(known, searched, references)
 
 
 def on_its_boundary() -> Ground:
