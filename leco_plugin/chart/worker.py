@@ -42,16 +42,10 @@ def run_job(
     on_progress: Callable[[float], None] | None = None,
 ) -> dict[str, Any]:
     """Trains, evaluates and measures; the record as JSON values. Arguments as of `train_job`."""
-    from leco_plugin.chart.contender import config_of
-
-    learn_seconds = protocol.budget().learn_seconds
-    nerfstudio = folder / "nerfstudio"
-    config = config_of(contender, data, nerfstudio, learn_seconds, protocol.held_out)
-    return train_job(config, contender, seed, data, protocol, folder, on_progress)[0]
+    return train_job(contender, seed, data, protocol, folder, on_progress)[0]
 
 
 def train_job(
-    config: TrainerConfig,
     contender: Contender,
     seed: int,
     data: Path,
@@ -59,9 +53,10 @@ def train_job(
     folder: Path,
     on_progress: Callable[[float], None] | None = None,
     *,
+    adapt: Callable[[TrainerConfig], TrainerConfig] = lambda config: config,
     looked_at: bool = True,
 ) -> tuple[dict[str, Any], Trainer]:
-    """Trains by the contender's config, evaluates and measures.
+    """Trains by the contender's config, which `adapt` may change, evaluates and measures.
 
     Args:
         folder: for the occupancy, if there is one, and for nerfstudio's own files.
@@ -69,6 +64,7 @@ def train_job(
     Returns:
         A run of `results.json`, with its `occupancy`, as JSON values; and the trainer.
     """
+    from leco_plugin.chart.contender import config_of
     from leco_plugin.evaluation.equal_loss import take_occupancy
     from leco_plugin.evaluation.timed_run import timed_run
     from leco_plugin.models.leco import LecoModel
@@ -81,9 +77,12 @@ def train_job(
         if isinstance(model, LecoModel) and not model.config.schedule.restart:
             frozen.update(_weights_of(model.mixture))
 
+    budget = protocol.budget()
+    place = folder / "nerfstudio"
+    config = config_of(contender, data, place, budget.learn_seconds, protocol.held_out)
     run, trainer = timed_run(
-        config,
-        protocol.budget(),
+        adapt(config),
+        budget,
         sampler=contender.sampler,
         seed=seed,
         curve_points=protocol.curve_points if looked_at else 0,

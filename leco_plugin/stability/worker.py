@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from leco_plugin.chart.contender import Contender, Protocol, config_of
+from leco_plugin.chart.contender import Contender, Protocol
 from leco_plugin.chart.worker import main, train_job
 from leco_plugin.evaluation.metrics import decibels
 from leco_plugin.evaluation.report import finite_or_null
@@ -76,10 +76,8 @@ def run_cell(
 ) -> dict[str, Any]:
     """Trains and measures; arguments and record as of `chart.worker.run_job`, with `measured`."""
     began = time.process_time()
-    config = with_fixed_batches(config_of(contender, data, folder / "nerfstudio"))
-    record, trainer = train_job(
-        config, contender, seed, data, protocol, folder, on_progress, looked_at=False
-    )
+    job = contender, seed, data, protocol, folder, on_progress
+    record, trainer = train_job(*job, adapt=with_fixed_batches, looked_at=False)
     options = contender.changes.get("occupancy.options", {})
     measured, shown = measure(trainer.pipeline, data, options.get("samples", Sizes.dense_samples))
     Image.fromarray(shown).save(folder / "view.png")

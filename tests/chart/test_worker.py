@@ -15,7 +15,7 @@ import torch
 from small_learner import small_mixture
 
 from leco_plugin.chart import worker
-from leco_plugin.chart.contender import Contender, Protocol, config_of
+from leco_plugin.chart.contender import Contender, Protocol
 from leco_plugin.chart.methods import SUITES
 from leco_plugin.chart.runner import FAILURE, JOB, PROGRESS, RESULT
 from leco_plugin.chart.worker import main, run_job, train_job
@@ -120,8 +120,7 @@ def test_gate_and_grids_are_measured_on_the_field_of_the_moment_of_freezing(
 
     monkeypatch.setattr(equal_loss, "at_equal_loss", at_equal_loss)
     one = replace(ONE, grids=(8, 16))
-    config = config_of(one, tiny_scene, tmp_path / "nerfstudio")
-    result, trainer = train_job(config, one, 3, tiny_scene, SHORT, tmp_path)
+    result, trainer = train_job(one, 3, tiny_scene, SHORT, tmp_path)
     assert result["occupancy"]["at_equal_loss"] == {"grids": [8, 16]}
     trained = trainer.pipeline.model.mixture.field.state_dict()
     (then,) = asked
@@ -171,8 +170,7 @@ def test_small_gates_are_taught_by_the_field_as_it_was_and_stand_beside(
 
     monkeypatch.setattr(equal_loss, "at_equal_loss", compared)
     one = replace(ONE, taught=True)
-    config = config_of(one, tiny_scene, tmp_path / "nerfstudio")
-    result, trainer = train_job(config, one, 3, tiny_scene, SHORT, tmp_path)
+    result, trainer = train_job(one, 3, tiny_scene, SHORT, tmp_path)
     found = result["occupancy"]["at_equal_loss"]
     taught, others = found.pop("taught"), found.pop("others")
     assert found == alone[0]  # the gate's own row knows nothing of them
