@@ -18,7 +18,7 @@ from results_page import sampling_section
 
 from leco_plugin.capacity import choice
 from leco_plugin.chart.learned import learned_of
-from leco_plugin.chart.panels import title_of
+from leco_plugin.chart.panels import finding_of
 from leco_plugin.chart.summary import lines_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -312,7 +312,7 @@ def test_every_picture_says_its_finding_in_ten_words() -> None:
     """Numbers count, signs do not."""
     results = ROOT / "benchmarks" / "results"
     titles = {
-        path.stem: title_of(json.loads(path.read_text()))
+        path.stem: finding_of(json.loads(path.read_text()), short=True)
         for path in sorted((results / "charts").glob("*.json"))
     }
     reports = {

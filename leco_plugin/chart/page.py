@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from leco_plugin.chart.learned import falls
-from leco_plugin.chart.panels import Panel, finding_of, shown_of, title_of
+from leco_plugin.chart.panels import Panel, finding_of, shown_of
 from leco_plugin.chart.summary import Line, best_so_far, circumstances
 from leco_plugin.chart.theme import LIGHT, style, write_page_file
 
@@ -41,17 +41,17 @@ def write_page(results: Mapping[str, Any], path: Path) -> Path:
         is_by_size = not shown.space[0].more_x
         figure.update_xaxes(type="log" if is_by_size else "linear", row=3, col=1)
         figure.update_yaxes(title_text="volume kept at equal loss, %", row=3, col=1)
-    title = html.escape(title_of(results))
+    title = finding_of(results, short=True)
     lines = filter(None, [finding_of(results), circumstances(results), falls(shown.lines)])
     below = "<br>".join(html.escape(line) for line in lines)  # one line would be cut off
     figure.update_layout(
-        title={"text": f"<b>{title}</b><br><sub>{below}</sub>"},
+        title={"text": f"<b>{html.escape(title)}</b><br><sub>{below}</sub>"},
         template="plotly_white",
         height=1100 if shown.space else 820,
         legend={"orientation": "h", "y": -0.08},
         margin={"t": 130},
     )
-    return write_page_file(figure, path, title_of(results))
+    return write_page_file(figure, path, title)
 
 
 def _add_curves(figure: Any, lines: Sequence[Line]) -> None:

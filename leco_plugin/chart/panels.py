@@ -30,26 +30,17 @@ HELD_COSTS = {"size": "size of the occupancy, kB", "learn_seconds": LEARNING.tit
 """Names in `Held` of what an occupancy costs, and their titles."""
 
 
-def title_of(results: Mapping[str, Any]) -> str:
-    """What a picture of results shows, in about ten words; `finding_of` has all figures."""
+def finding_of(results: Mapping[str, Any], short: bool = False) -> str:
+    """One sentence, without a full stop, about results that hold at least one run; a short one, for
+    a title, has about ten words."""
     lines = lines_of(results)
     if held := representations_of(lines):
-        return sentence(shortest_verdict(held))
+        never = 0 if short else len(never_held_of(lines))
+        said = shortest_verdict(held) if short else verdict(held)
+        return sentence(said) + (f"; {never} not always frozen" if never else "")
     if asks_what_was_learned(results):
-        return sentence(learned_headline(learned_of(lines), short=True))
-    return sentence(headline(results, short=True))
-
-
-def finding_of(results: Mapping[str, Any]) -> str:
-    """One sentence, without a full stop, about results that hold at least one run."""
-    lines = lines_of(results)
-    held = representations_of(lines)
-    if held:
-        never = len(never_held_of(lines))
-        return sentence(verdict(held)) + (f"; {never} not always frozen" if never else "")
-    if asks_what_was_learned(results):
-        return sentence(learned_headline(learned_of(lines)))
-    return sentence(headline(results))
+        return sentence(learned_headline(learned_of(lines), short))
+    return sentence(headline(results, short))
 
 
 def asks_what_was_learned(results: Mapping[str, Any]) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leco_plugin.chart.learned import learned_of
-from leco_plugin.chart.panels import Panel, Point, Shown, finding_of, shown_of, title_of
+from leco_plugin.chart.panels import Panel, Point, Shown, finding_of, shown_of
 from leco_plugin.chart.summary import (
     LEARNING,
     LOST_SURFACE_MASS,
@@ -58,7 +58,7 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
     shown = shown_of(results)
     with themed(theme):
         figure = new_figure((10, 8.4), theme.page)
-        title = balanced(title_of(results))
+        title = balanced(finding_of(results, short=True))
         figure.text(0.015, TOP, title, va="top", fontsize=17, fontweight="bold")
         below = TOP - 0.01 - LINE_HEIGHT * (title.count("\n") + 1)
         said = [f"{finding_of(results)}.", circumstances(results)]

@@ -272,29 +272,26 @@ def headline(results: Mapping[str, Any], short: bool = False) -> str:
     if found.margin is None:
         return f"{best.name} {best.psnr:.1f} dB, {second.name} {second.psnr:.1f} dB ({found.by})"
     apart = f"{found.difference:.2f} ± {found.margin:.2f}"
-    if found.is_open:
-        figures = f"{best.psnr:.1f} and {second.psnr:.1f} dB"
-        both = f"{best.name} and {second.name} are {found.word}"
-        said = f"{both}: {figures}, {apart} apart ({found.by})"
-        others = [line for line in ranked if not line.learned]
-        if best.learned and second.learned and others:
-            leads = [compare(line.psnrs, others[0].psnrs) for line in (best, second)]
-            if all(lead.word == "ahead" for lead in leads):  # then they have margins
-                least = f"{leads[1].difference:.2f} ± {leads[1].margin:.2f}"
-                if short:
-                    return f"two methods with learned occupancy lead by {least} dB"
-                name = f"{others[0].name}, the best of the others"
-                return f"{said}; {name}, is {least} behind {second.name}"
-        if not short:
-            return said
-        level = f"{best.name} is level with the next best"
-        if found.word == "level":
-            return level
-        return f"undecided: {both_figures}"
-    if short:
+    if not found.is_open and short:
         return f"{best.name} is ahead by {apart} dB"
-    said = f"{best.name} is ahead: {best.psnr:.1f} dB, {apart} more than {second.name} ({found.by})"
-    return f"{said}, whose grid is still in its warm-up" if second.warming_up else said
+    if not found.is_open:
+        more = f"{apart} more than {second.name} ({found.by})"
+        cold = ", whose grid is still in its warm-up" if second.warming_up else ""
+        return f"{best.name} is ahead: {best.psnr:.1f} dB, {more}{cold}"
+    figures = f"{best.psnr:.1f} and {second.psnr:.1f} dB, {apart} apart ({found.by})"
+    said = f"{best.name} and {second.name} are {found.word}: {figures}"
+    others = [line for line in ranked if not line.learned]
+    if best.learned and second.learned and others:
+        leads = [compare(line.psnrs, others[0].psnrs) for line in (best, second)]
+        if all(lead.word == "ahead" for lead in leads):  # then they have margins
+            least = f"{leads[1].difference:.2f} ± {leads[1].margin:.2f}"
+            if short:
+                return f"two methods with learned occupancy lead by {least} dB"
+            name = f"{others[0].name}, the best of the others"
+            return f"{said}; {name}, is {least} behind {second.name}"
+    if short and found.word == "level":
+        return f"{best.name} is level with the next best"
+    return f"undecided: {both_figures}" if short else said
 
 
 def circumstances(results: Mapping[str, Any]) -> str:
