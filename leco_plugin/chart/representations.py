@@ -174,18 +174,15 @@ def shortest_verdict(representations: Sequence[Representation]) -> str:
     if not ours:
         return OURS_NEVER_FROZEN
     for one in ours:
-        others = [other for other in representations if other is not one]
-        if all(one.kept <= other.kept for other in others):
+        if all(one.kept <= other.kept for other in representations):
             return f"{one.name} keeps least space, {one.kept:.1f}%"
     for one in ours:
-        others = [other for other in representations if other is not one]
-        if _is_cheapest(one, others, "size"):
+        if _is_smallest(one, representations):
             return f"{one.name} is the smallest occupancy: {one.median('size'):.0f} kB"
     for one in ours:
         if fronts := fronts_of(one, representations):
-            return (
-                f"no occupancy {' or '.join(AS_CHEAP[name] for name in fronts)} as ours keeps less"
-            )
+            as_cheap = " or ".join(AS_CHEAP[name] for name in fronts)
+            return f"no occupancy {as_cheap} as ours keeps less"
     leader = _best_ahead(ours[0], representations, "size")
     return f"{ours[0].name} keeps more space than {leader}"
 
@@ -211,11 +208,11 @@ def _standing_of(one: Representation, all_of_them: Sequence[Representation]) -> 
     return f"{one.name}: {'; '.join(parts)}"
 
 
-def _is_cheapest(one: Representation, others: Sequence[Representation], figure: str) -> bool:
+def _is_smallest(one: Representation, all_of_them: Sequence[Representation]) -> bool:
     return all(
-        other.median(figure) > one.median(figure) and not one.against(other, figure).is_open
-        for other in others
-        if other.has(figure)
+        other.median("size") > one.median("size") and not one.against(other, "size").is_open
+        for other in all_of_them
+        if other is not one
     )
 
 

@@ -66,15 +66,13 @@ class FieldGrids:
         steps = halvings(cells, 0 if self.scores is None else len(self.scores))
         if self.scores is None or 2 * len(self.scores) != steps[0]:
             self.scores, self.floor, self.clock = None, 0.0, Clock()
-        self.clock.start()
-        for step in steps:
-            asked = cells_to_ask(step, self.scores, self.floor, self.box.low.device)
-            if int(asked.sum()) * probes_in_a_cell(step) > self.most:
-                self.clock.stop()
-                return None
-            self.scores = fill_cells(self.density, self.box, asked, known=self.known)
-            self.floor = self.floor_of(self.scores)
-        self.clock.stop()
+        with self.clock.running():
+            for step in steps:
+                asked = cells_to_ask(step, self.scores, self.floor, self.box.low.device)
+                if int(asked.sum()) * probes_in_a_cell(step) > self.most:
+                    return None
+                self.scores = fill_cells(self.density, self.box, asked, known=self.known)
+                self.floor = self.floor_of(self.scores)
         return self.scores
 
 
