@@ -162,8 +162,8 @@ def search(
     ground: Ground,
     bounds: Bounds,
     gates: Sequence[GateConfig] | None = None,
-    on_rung: Callable[[Rung], None] | None = None,
-    on_progress: Callable[[float], None] | None = None,
+    on_rung: Callable[[Rung], None] = lambda rung: None,
+    on_progress: Callable[[float], None] = lambda share: None,
 ) -> Found:
     """Walks up the ladder and stops at the first gate that is within the bounds on unseen rays.
 
@@ -178,14 +178,13 @@ def search(
     lesson = lesson_of(ground.original, ground.taught)
     rungs: list[Rung] = []
     looks = 0
-    show = on_progress or (lambda share: None)
     for number, config in enumerate(gates):
         started = seconds_now()
         parts = [(number + done) / len(gates) for done in (0.0, 1.0 / (1 + LONGER), 1.0)]
         for times, (first, last) in zip((1, LONGER), pairwise(parts)):
 
             def show_part(share: float, first: float = first, last: float = last) -> None:
-                show(first + share * (last - first))
+                on_progress(first + share * (last - first))
 
             gate = _teach_in_place(config, lesson, times * STEPS, ground.original, show_part)
             rung, gate = _measure(ground, gate, bounds, volume, kept, looks + 1)
@@ -193,11 +192,10 @@ def search(
             nearly = rung.lost_surface_mass <= NEARLY * MARGIN * bounds.lost_surface_mass
             if rung.verdict == "chosen" or not nearly:
                 break
-        show(parts[-1])
+        on_progress(parts[-1])
         rung.seconds = round(seconds_now() - started, 2)
         rungs.append(rung)
-        if on_rung is not None:
-            on_rung(rung)
+        on_rung(rung)
         if rung.verdict == "chosen":
             return Found(gate, rungs)
     return Found(None, rungs)

@@ -84,7 +84,6 @@ def at_equal_loss(
     datamanager: Any,
     grids: Sequence[int] = (),
     others: Mapping[str, Callable[[Tensor], Tensor] | Tensor] | None = None,
-    config: CalibrationConfig = CALIBRATION,
 ) -> dict[str, Any]:
     """What the mixture's gate keeps at `LOST_SURFACE_MASS`, and grids made from the same field.
 
@@ -108,7 +107,7 @@ def at_equal_loss(
         ValueError: held-out rays see no surface.
     """
     with evaluating(mixture):
-        mapped, weights, occupancies = _measured(mixture, datamanager, config)
+        mapped, weights, occupancies = _measured(mixture, datamanager)
         if not bool((weights > 0.0).any()):
             raise ValueError("no surface is seen by the held-out rays, so that none can be lost")
         taught = candidates_of(mixture, rays_of_photographs(datamanager, TAUGHT_RAYS))
@@ -203,14 +202,12 @@ def _kept_by_grids(
     return rows, left_out
 
 
-def _measured(
-    mixture: Mixture, datamanager: Any, config: CalibrationConfig
-) -> tuple[Tensor, Tensor, Tensor]:
+def _measured(mixture: Mixture, datamanager: Any) -> tuple[Tensor, Tensor, Tensor]:
     """Candidates of held-out rays before the backdrop: mapped positions [M, 3], weights near
     surfaces [M], and o(x) [M]."""
-    rays, _ = held_out_rays(mixture, datamanager, config.rays)
+    rays, _ = held_out_rays(mixture, datamanager, CALIBRATION.rays)
     pieces = []
-    for some in in_chunks(rays, config.rays_at_once):
+    for some in in_chunks(rays, CALIBRATION.rays_at_once):
         found = dense_reference(mixture, some)
         before = ~found.always_kept
         places = mapped_middles(mixture.region.space, some, found.intervals)
@@ -246,11 +243,11 @@ def is_reached(taught: Tensor, mapped: Tensor) -> Tensor:
     return found[cells(mapped)]
 
 
-def rays_of_photographs(datamanager: Any, count: int, seed: int = 0) -> RayBundle:
+def rays_of_photographs(datamanager: Any, count: int) -> RayBundle:
     """Rays anywhere in the training photographs. The pixels and the random numbers of training are
     not touched."""
     cameras = datamanager.train_dataset.cameras.to("cpu")
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     numbers = torch.randint(len(cameras), (count, 1), generator=generator)
     sizes = torch.cat([cameras.height[numbers[:, 0]], cameras.width[numbers[:, 0]]], dim=-1)
     coordinates = torch.rand(count, 2, generator=generator) * sizes
