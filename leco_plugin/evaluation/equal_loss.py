@@ -28,7 +28,7 @@ from leco_plugin.evaluation.field_grids import (
     look_up_scores,
     octree_bytes,
 )
-from leco_plugin.evaluation.inspection import ViewBox, in_parts, whole_box
+from leco_plugin.evaluation.inspection import ViewBox, ask, in_parts, whole_box
 from leco_plugin.evaluation.report import finite_or_null
 from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.dense import dense_reference, evaluating, in_chunks
@@ -323,10 +323,9 @@ def compare_with_truth(
     surface = truth.visible_surface("test")
     order = torch.randperm(len(surface), generator=torch.Generator().manual_seed(0))
     air = free_points(truth, surface, aabb, step_size, highest)
-    return {
-        "kept_surface_recall": _share(kept(occupancy, surface[order[:MOST_SURFACE_POINTS]])),
-        "free_space_skipped": _share(~kept(occupancy, air)),
-    }
+    chosen = surface[order[:MOST_SURFACE_POINTS]]
+    recalled, kept = (ask(occupancy, occupancy.occupied, points) for points in (chosen, air))
+    return {"kept_surface_recall": _share(recalled), "free_space_skipped": _share(~kept)}
 
 
 def free_points(
@@ -347,13 +346,6 @@ def free_points(
     points = low + unit * (high - low)
     points = points[~truth.occupied(points)]
     return points[truth.distance(points) * truth.scale > step_size]
-
-
-@torch.no_grad()
-def kept(occupancy: Occupancy, points: Tensor) -> Tensor:
-    """Whether each of the positions [N, 3] is kept: bool [N] on the CPU."""
-    device = occupancy.threshold_value.device
-    return in_parts(lambda part: occupancy.occupied(part.to(device)).cpu(), points)
 
 
 def _share(mask: Tensor) -> float | None:

@@ -190,24 +190,27 @@ def numbers(value: Any) -> list[float]:
 
 
 @torch.no_grad()
+def ask(occupancy: Occupancy, question: Callable[[Tensor], Tensor], positions: Tensor) -> Tensor:
+    """A function of positions [..., 3], asked about some at a time on an occupancy's device: [...]
+    on the CPU."""
+    device = occupancy.threshold_value.device
+    answers = in_parts(lambda part: question(part.to(device)).cpu(), positions.reshape(-1, 3))
+    return answers.reshape(positions.shape[:-1])
+
+
 def query(occupancy: Occupancy, positions: Tensor) -> Tensor:
     """o(x) of positions [..., 3] in pieces: [...] float32 on the CPU."""
-    device = occupancy.threshold_value.device
-    values = in_parts(lambda part: occupancy.query(part.to(device)).cpu(), positions.reshape(-1, 3))
-    return values.reshape(positions.shape[:-1])
+    return ask(occupancy, occupancy.query, positions)
 
 
-@torch.no_grad()
 def seen_at(occupancy: Occupancy, positions: Tensor) -> Tensor:
     """Whether any training ray comes near positions [..., 3]: bool [...] on the CPU."""
-    device = occupancy.threshold_value.device
 
     def seen(part: Tensor) -> Tensor:
-        mapped = occupancy.space.map(part.to(device))
-        inside = mapped.abs().amax(dim=-1) <= 1.0
-        return (occupancy.seen(mapped.clamp(-1.0, 1.0)) & inside).cpu()
+        mapped = occupancy.space.map(part)
+        return occupancy.seen(mapped.clamp(-1.0, 1.0)) & (mapped.abs().amax(dim=-1) <= 1.0)
 
-    return in_parts(seen, positions.reshape(-1, 3)).reshape(positions.shape[:-1])
+    return ask(occupancy, seen, positions)
 
 
 def in_parts(function: Callable[[Tensor], Tensor], positions: Tensor) -> Tensor:
