@@ -193,8 +193,8 @@ def _measure_grid(taught: Taught, candidate: Candidate, lost: float) -> dict[str
     scores = taught_grid(taught.lesson, box, candidate.resolution)
     places = taught.mapped, taught.volume, taught.held_out.worth
     both = [
-        measure(taught.held_out, *found, lost) | {"octree_bytes": size}
-        for *found, size in plain_and_dilated(scores, box, *places, lost)
+        measure(taught.held_out, of_rays, of_volume, lost) | {"octree_bytes": size}
+        for of_rays, of_volume, size in plain_and_dilated(scores, box, *places, lost)
     ]
     return min(both, key=lambda one: one["kept_volume"])
 

@@ -164,8 +164,8 @@ def _kept_by_grid(
     """What a grid of scores [n, n, n] keeps, as it is or dilated, whichever keeps less."""
     both = plain_and_dilated(scores, box, mapped, volume, weights, LOST_SURFACE_MASS)
     rows = [
-        {"dilated": bool(dilated), **_kept_by(weights, *found), "octree_bytes": size}
-        for dilated, (*found, size) in enumerate(both)
+        {"dilated": bool(dilated), **_kept_by(weights, of_rays, of_volume), "octree_bytes": size}
+        for dilated, (of_rays, of_volume, size) in enumerate(both)
     ]
     return min(rows, key=lambda one: one["kept_reached_volume"])
 
@@ -196,9 +196,9 @@ def _kept_by_grids(
         if scores is None:
             left_out.append(n)
             continue
-        row = {"resolution": n, "bytes": math.ceil(n**3 / 8)}
-        row["update_seconds"] = round(filling.clock.seconds, 3)
-        rows.append(row | of_grid(scores))
+        seconds = round(filling.clock.seconds, 3)
+        size = {"resolution": n, "bytes": math.ceil(n**3 / 8)}
+        rows.append({**size, "update_seconds": seconds, **of_grid(scores)})
     return rows, left_out
 
 
