@@ -132,8 +132,6 @@ class Chart:
         try:
             run = runner(job, show)
         except RunFailed as failure:
-            if self.stop.is_set():  # its process was told to end when we were
-                raise KeyboardInterrupt from None
             self.folder.fail(job, str(failure))
             return f"{title}: failed: {failure}"
         code = run.pop("code", None) or describe_code()

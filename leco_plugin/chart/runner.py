@@ -249,7 +249,7 @@ class ProcessRunner:
         log = place / LOGS / f"{job.name}.log"
         status = self._wait_for(work, log, show)
         if not (work / RESULT).exists():
-            if self.stop.is_set():  # the process was told to end when this one was
+            if self.stop.is_set() or status == -signal.SIGINT:  # Ctrl-C tells all processes to end
                 raise KeyboardInterrupt
             raise RunFailed(_reason(work, status, log))
         result: dict[str, Any] = json.loads((work / RESULT).read_text())

@@ -154,6 +154,13 @@ def test_stopping_the_chart_ends_the_run_that_is_under_way(folder: RunFolder) ->
     assert time.monotonic() - began < 30
 
 
+def test_a_run_that_ctrl_c_has_ended_before_us_is_no_failure(folder: RunFolder) -> None:
+    """All processes of a terminal get the signal, and a child may be the first to end."""
+    ended = OPENED + "import signal; signal.signal(2, signal.SIG_DFL); os.kill(os.getpid(), 2)"
+    with pytest.raises(KeyboardInterrupt):
+        runner(folder, ended)(JOB, lambda share: None)
+
+
 def test_a_run_ends_when_the_process_that_waits_for_it_is_gone() -> None:
     code = (
         "import time; from leco_plugin.chart.runner import die_with_parent; "
