@@ -205,13 +205,11 @@ def write_ply(
     comments in its head. OSError if it cannot be written there."""
     from matplotlib import colormaps
 
-    rows = np.empty(len(surface.values), dtype=[("xyz", "<f8", 3), ("rgb", "u1", 4)])
-    rows["xyz"] = surface.positions.numpy()
     if colours is None:
-        rows["rgb"] = colormaps[COLOURS](surface.values.clamp(0.0, 1.0).numpy(), bytes=True)
+        paint = colormaps[COLOURS](surface.values.clamp(0.0, 1.0).numpy(), bytes=True)
     else:
-        rows["rgb"] = np.pad(colours, ((0, 0), (0, 1)), constant_values=255)
-    write_points(path, rows, comments)
+        paint = np.pad(colours, ((0, 0), (0, 1)), constant_values=255)
+    write_points(path, surface.positions.double().numpy(), paint, comments)
 
 
 PATHS = ("file_path", "mask_path", "depth_file_path")
@@ -249,9 +247,7 @@ def write_splat_init(
         kept = (query(occupancy, of_run) >= occupancy.threshold).numpy()
         colours = np.concatenate([known.colours[kept], colours_near(known, places)])
         places, sparse = np.concatenate([known.positions[kept], places]), int(kept.sum())
-    rows = np.zeros(len(places), dtype=[("xyz", "<f8", 3), ("rgb", "u1", 3)])
-    rows["xyz"], rows["rgb"] = places, colours
-    write_points(points, rows, in_comments(georeference(description)))
+    write_points(points, places, colours, in_comments(georeference(description)))
     copy = _from_elsewhere(meta, description.parent, out.parent)
     write_json(out, copy | {"ply_file_path": points.name}, indent=1, allow_nan=True)
     return {"points": len(places), "sparse_points": sparse, "photograph_colours": known is not None}

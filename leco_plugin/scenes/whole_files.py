@@ -15,6 +15,7 @@ from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.locks import writing_into
 
 if TYPE_CHECKING:  # `leco --help` loads no numpy for it
+    import numpy as np
     from numpy.typing import NDArray
 
 PART = ".part"
@@ -24,7 +25,6 @@ LONGEST = 40
 POINTER = b"version https://git-lfs"
 FETCH = "is a pointer of Git LFS: `git lfs pull` fetches the file"
 """What to say of a file that `is_pointer`."""
-PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar"}
 
 
 def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
@@ -73,14 +73,19 @@ def remove_parts(folder: Path) -> None:
         part.unlink(missing_ok=True)
 
 
-def write_points(path: Path, rows: NDArray[Any], comments: Sequence[str] = ()) -> None:
-    """Writes points as a binary PLY file: rows [N] of `xyz`, three floats, and of `rgb`, three or
-    four bytes, after lines of comment. OSError if it cannot be written there."""
-    properties = []
-    for field, names in (("xyz", "x y z"), ("rgb", "red green blue alpha")):
-        kind, shape = rows.dtype[field].subdtype or (rows.dtype[field], (1,))
-        named = names.split()[: shape[0]]
-        properties += [f"property {PLY_TYPES[kind.str[1:]]} {name}" for name in named]
+def write_points(
+    path: Path, places: NDArray[Any], colours: NDArray[np.uint8], comments: Sequence[str] = ()
+) -> None:
+    """Writes places [N, 3], float32 or float64, and colours [N, 3 or 4] as a binary PLY file, after
+    lines of comment. OSError if it cannot be written there."""
+    import numpy as np
+
+    channels, kind = colours.shape[1], "float" if places.itemsize == 4 else "double"
+    stored = [("xyz", places.dtype.newbyteorder("<"), 3), ("rgb", "u1", channels)]
+    rows = np.empty(len(places), stored)
+    rows["xyz"], rows["rgb"] = places, colours
+    properties = [f"property {kind} {axis}" for axis in "xyz"]
+    properties += [f"property uchar {c}" for c in ("red", "green", "blue", "alpha")[:channels]]
     head = ["ply", "format binary_little_endian 1.0", *(f"comment {each}" for each in comments)]
     head += [f"element vertex {len(rows)}", *properties, "end_header\n"]
     write_whole(path, lambda file: file.write("\n".join(head).encode() + rows.tobytes()))

@@ -330,14 +330,14 @@ def _take_pictures(stage: Stage, capture: Capture, folder: Path) -> None:
             view.lens.some_points(shot.written, view.depth, seen.image, POINTS_PER_VIEW, random)
         )
         frames.append(_frame(shot, view.lens))
-    cloud = np.concatenate(clouds)
-    if len(cloud):
-        write_points(folder / POINTS, cloud)
+    places, colours = map(np.concatenate, zip(*clouds))
+    if len(places):
+        write_points(folder / POINTS, places, colours)
     held_out = [shot.file for shot in shots if shot.held_out]
     transforms = {
         "camera_model": "OPENCV",
         "orientation_override": "none",
-        **({"ply_file_path": POINTS} if len(cloud) else {}),
+        **({"ply_file_path": POINTS} if len(places) else {}),
         "frames": frames,
         "train_filenames": [shot.file for shot in shots if not shot.held_out],
         "val_filenames": held_out,

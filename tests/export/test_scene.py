@@ -53,11 +53,9 @@ def scene(tmp_path: Path) -> Path:
     offsets = generator.normal(size=(500, 3))
     offsets *= 0.9 * RADIUS / np.linalg.norm(offsets, axis=1, keepdims=True)
     places = 2.0 * (np.array(CENTRE) + offsets)
-    rows = np.zeros(501, dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    rows["xyz"][:500], rows["xyz"][500] = places, 500.0
-    west = offsets[:, 0] < 0.0
-    rows["rgb"][:500] = np.where(west[:, None], (255, 0, 0), (0, 0, 255))
-    write_points(folder / "points.ply", rows)
+    places = np.concatenate([places, [[500.0] * 3]]).astype(np.float32)
+    colours = np.where(offsets[:, :1] < 0.0, (255, 0, 0), (0, 0, 255)).astype(np.uint8)
+    write_points(folder / "points.ply", places, np.pad(colours, ((0, 1), (0, 0))))
     meta: dict[str, Any] = {"ply_file_path": "points.ply", "fl_x": 10.0}
     meta |= {"geographic_origin": ORIGIN, "metres_per_unit": 1.0}
     meta |= {"train_filenames": ["images/a.png"]}

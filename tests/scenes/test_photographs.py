@@ -353,10 +353,8 @@ def test_splatfacto_starts_from_the_sparse_points_and_their_colours(scene: Path)
     """In its own data manager, in the model's coordinates; open3d is not asked."""
     from nerfstudio.configs.method_configs import method_configs
 
-    rows = np.zeros(40, dtype=[("xyz", "<f8", 3), ("rgb", "u1", 3)])
     xyz = np.random.default_rng(0).normal(size=(40, 3))
-    rows["xyz"], rows["rgb"] = xyz, (250, 128, 3)
-    write_points(scene / "points.ply", rows)
+    write_points(scene / "points.ply", xyz, np.full((40, 3), (250, 128, 3), np.uint8))
     change(scene, lambda meta: meta.update(ply_file_path="points.ply"))
     config = replace(
         method_configs["splatfacto"].pipeline.datamanager,
@@ -368,7 +366,7 @@ def test_splatfacto_starts_from_the_sparse_points_and_their_colours(scene: Path)
     places, colours = (outputs.metadata[f"points3D_{name}"] for name in ("xyz", "rgb"))
     expected = moved(torch.from_numpy(xyz), parsed_frame(outputs).double())
     assert torch.allclose(places, expected.float(), atol=1e-5)
-    assert colours.dtype == torch.uint8 and colours.tolist() == rows["rgb"].tolist()
+    assert colours.dtype == torch.uint8 and colours.tolist() == [[250, 128, 3]] * 40
     assert manager.next_train(0)[1]["image"].shape == (32, 32, 3)
 
 

@@ -6,7 +6,6 @@ Poses are camera-to-world [3, 4] in metres, OpenGL axes (x right, y up, looking 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.random import Generator
@@ -111,15 +110,12 @@ class Lens:
         image: NDArray[np.uint8],
         most: int,
         random: Generator,
-    ) -> NDArray[Any]:
-        """Up to so many points that a picture [height, width, 3 or 4] shows: rows of `xyz` and
-        `rgb`."""
+    ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """Up to so many points [P, 3] that a picture [height, width, 3 or 4] shows, and their
+        colours [P, 3]."""
         seen = np.argwhere(np.isfinite(depth))
         chosen = tuple(seen[random.permutation(len(seen))[:most]].T)
-        rows = np.empty(len(chosen[0]), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
-        rows["xyz"] = self.points(pose, depth)[chosen]
-        rows["rgb"] = image[chosen][:, :3]
-        return rows
+        return self.points(pose, depth)[chosen].astype(np.float32), image[chosen][:, :3]
 
     def axial(self, depth: NDArray[np.floating]) -> NDArray[np.float32]:
         """Depth files from ray depths (metres, inf for nothing): see `city.folder`."""

@@ -96,7 +96,16 @@ class NerfstudioLayout(Layout):
         write_whole(folder / depths, lambda f: np.save(f, self.lens.axial(depth)))
 
     def finish(self, folder: Path) -> None:
-        write_points(folder / POINTS, self._points(folder))
+        random = np.random.default_rng([self.seed, 13])
+        found = []
+        for view in self.views:  # from the files, so that what a killed run wrote counts too
+            picture, depths = self.files(view)
+            depth = self.lens.along_ray(np.load(folder / depths, allow_pickle=False))
+            with Image.open(folder / picture) as opened:
+                image = np.asarray(opened)
+            most = _SPARSE_POINTS_PER_VIEW
+            found.append(self.lens.some_points(view.pose, depth, image, most, random))
+        write_points(folder / POINTS, *map(np.concatenate, zip(*found)))
         write_json(folder / TRANSFORMS, self._transforms(), indent=1)
 
     def _transforms(self) -> dict[str, Any]:
@@ -122,20 +131,6 @@ class NerfstudioLayout(Layout):
             "val_filenames": tested,
             "test_filenames": tested,
         }
-
-    def _points(self, folder: Path) -> NDArray[Any]:
-        """Some surface points of each view, [N] rows of `xyz` (metres) and `rgb`; read back from
-        its files, so that what a killed run wrote counts too."""
-        random = np.random.default_rng([self.seed, 13])
-        rows = []
-        for view in self.views:
-            picture, depths = self.files(view)
-            depth = self.lens.along_ray(np.load(folder / depths, allow_pickle=False))
-            with Image.open(folder / picture) as opened:
-                image = np.asarray(opened)
-            most = _SPARSE_POINTS_PER_VIEW
-            rows.append(self.lens.some_points(view.pose, depth, image, most, random))
-        return np.concatenate(rows)
 
 
 class MegaNerfLayout(Layout):

@@ -239,7 +239,5 @@ def write_scene(scene: Path, model: Any, meta: dict[str, Any]) -> None:
 
 def write_sparse_points(path: Path, places: Array, colours: NDArray[np.uint8]) -> None:
     """Writes sparse points [P, 3] with their colours [P, 3] as a PLY file."""
-    kind = "<f8" if np.abs(places).max(initial=0.0) > LARGE else "<f4"
-    rows = np.zeros(len(places), dtype=[("xyz", kind, 3), ("rgb", "u1", 3)])
-    rows["xyz"], rows["rgb"] = places, colours
-    write_points(path, rows)
+    large = np.abs(places).max(initial=0.0) > LARGE
+    write_points(path, places.astype(np.float64 if large else np.float32), colours)
