@@ -25,7 +25,7 @@ from leco_plugin.occupancy import SEEN_CELLS, Occupancy
 from leco_plugin.samplers import marching
 from leco_plugin.samplers.base import midpoints
 from leco_plugin.scenes.coloured_points import (
-    ColouredPoints,
+    PointCloud,
     camera_places,
     coloured_points,
     colours_near,
@@ -229,7 +229,7 @@ def exposed(kept: Tensor, beyond: bool = False) -> Tensor:
 class SceneColours(NamedTuple):
     """The scene's sparse points, and how the run lies in their coordinates."""
 
-    points: ColouredPoints
+    points: PointCloud
     back: Tensor
     """[3, 4] float64, from the run to the data."""
 

@@ -42,22 +42,13 @@ COLOURS = "points3D_rgb"
 """Key of their colours, uint8 [P, 3], beside `POINTS`. nerfstudio wants both or neither."""
 
 
-class ColouredPoints(NamedTuple):
+class PointCloud(NamedTuple):
     """Points in the coordinates of the data."""
 
     positions: NDArray[np.float64]
-    """[P, 3]."""
-    colours: NDArray[np.uint8]
-    """[P, 3]."""
-
-
-class CloudFile(NamedTuple):
-    """What a file of points says."""
-
-    positions: NDArray[np.float64]
     """[P, 3], all finite."""
-    colours: NDArray[np.uint8] | None
-    """[P, 3]; None where it has none."""
+    colours: NDArray[np.uint8]
+    """[P, 3]; [0, 3] where they have none."""
 
 
 def description_of_run(file: Path) -> Path | None:
@@ -110,7 +101,7 @@ def description_in(data: Path) -> Path:
     return file
 
 
-def read_cloud(path: Path) -> CloudFile:
+def read_cloud(path: Path) -> PointCloud:
     """The finite vertices of a .ply, also of a mesh. InputError if it cannot be read as points."""
     import trimesh
 
@@ -130,22 +121,23 @@ def read_cloud(path: Path) -> CloudFile:
         why = one_line(error, 120)
         raise InputError(f"{path} cannot be read as sparse points: {why}") from None
     sound = np.isfinite(positions).all(axis=1)
-    known = len(colours) == len(positions) > 0
-    return CloudFile(positions[sound], colours[sound, :3] if known else None)
+    if not len(colours) == len(positions) > 0:
+        return PointCloud(positions[sound], np.zeros((0, 3), np.uint8))
+    return PointCloud(positions[sound], colours[sound, :3])
 
 
-def coloured_points(description: Path) -> ColouredPoints | None:
+def coloured_points(description: Path) -> PointCloud | None:
     """Sparse points with colours that a transforms.json names, or None. InputError if they cannot
     be read."""
     name = load_json(description).get("ply_file_path")
     path = find_file(description.parent / str(name))
     if name is None or not path.is_file():
         return None
-    positions, colours = read_cloud(path)
-    return None if colours is None or not len(positions) else ColouredPoints(positions, colours)
+    cloud = read_cloud(path)
+    return cloud if len(cloud.colours) else None
 
 
-def colours_near(known: ColouredPoints, positions: NDArray[np.float64]) -> NDArray[np.uint8]:
+def colours_near(known: PointCloud, positions: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Mean colours [N, 3] of the `NEAREST` known points of each position [N, 3]."""
     from scipy.spatial import KDTree
 
@@ -214,7 +206,7 @@ def georeference(description: Path) -> dict[str, Any]:
     return {name: meta[name] for name in ("geographic_origin", "metres_per_unit") if name in meta}
 
 
-def read_points(meta: dict[str, Any], folder: Path) -> CloudFile | None:
+def read_points(meta: dict[str, Any], folder: Path) -> PointCloud | None:
     """Sparse points in the coordinates of the file, or None. A file that is named and not there, or
     empty, is said, for learning without points is slower. InputError if it cannot be read."""
     name = meta.get("ply_file_path")
@@ -231,11 +223,11 @@ def read_points(meta: dict[str, Any], folder: Path) -> CloudFile | None:
     return points
 
 
-def points_in_model(points: CloudFile, frame: Tensor) -> dict[str, Tensor]:
+def points_in_model(points: PointCloud, frame: Tensor) -> dict[str, Tensor]:
     """Sparse points and colours as metadata of nerfstudio's readers, taken to the model by a frame
     [3, 4]: splatfacto starts there, from grey ones where the file has no colours."""
     positions, colours = points
-    if colours is None:
+    if not len(colours):
         colours = np.full(positions.shape, GREY, np.uint8)
     in_model = moved(torch.from_numpy(positions), frame.double()).float()
     return {POINTS: in_model, COLOURS: torch.from_numpy(colours)}

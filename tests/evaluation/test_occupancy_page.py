@@ -16,7 +16,7 @@ from leco_plugin.evaluation.inspection import SceneColours, ViewBox, whole_box
 from leco_plugin.evaluation.occupancy_page import faces_of, write_page
 from leco_plugin.evaluation.occupancy_picture import seen_from_above
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.scenes.coloured_points import ColouredPoints
+from leco_plugin.scenes.coloured_points import PointCloud
 
 RED, BLUE = (255, 0, 0), (0, 0, 255)
 
@@ -26,7 +26,7 @@ def colours() -> SceneColours:
     """Red west of the ball's middle, blue east of it, in data of twice the size."""
     offsets = np.random.default_rng(0).normal(size=(500, 3))
     places = 2.0 * (np.array(CENTRE) + offsets)
-    points = ColouredPoints(places, np.where(offsets[:, :1] < 0.0, RED, BLUE).astype(np.uint8))
+    points = PointCloud(places, np.where(offsets[:, :1] < 0.0, RED, BLUE).astype(np.uint8))
     return SceneColours(points, 2.0 * torch.eye(3, 4, dtype=torch.float64))
 
 
