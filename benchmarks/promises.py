@@ -22,7 +22,7 @@ from leco_plugin.learning.dense import dense_reference, in_chunks
 from leco_plugin.log import by_number, counted
 from leco_plugin.models.rendering import mapped_middles
 from leco_plugin.occupancy import CAMERAS_THAT_VOUCH
-from leco_plugin.scenes.pixels.held_out_pixels import some_numbers
+from leco_plugin.scenes.pixels.held_out_pixels import SOME
 
 RAYS = 2048
 """Of each test photograph."""
@@ -44,7 +44,7 @@ def row_of(run: Path, data: Path) -> dict[str, Any]:
     if not promised:
         raise SystemExit(f"no photograph vouched for the occupancy of {run}")
     occupancy, dataset = mixture.occupancy().eval(), source.manager.eval_dataset
-    tests = draw_test_rays(source, occupancy, RAYS * len(some_numbers(dataset)))
+    tests = draw_test_rays(source, occupancy, RAYS * min(SOME, len(dataset)))
     assert tests is not None
     rows = []
     for rays in in_chunks(tests.rays, RAYS):

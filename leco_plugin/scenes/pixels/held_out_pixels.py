@@ -18,6 +18,7 @@ from torch import Tensor
 
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.pixels.stored_pictures import StoredPictures
+from leco_plugin.scenes.survey import chosen_cameras
 
 PERIODS = (11, 9, 7, 5)
 """Pixels between two that are held out, in both directions: 1 in 121 where pictures have enough, 1
@@ -94,6 +95,8 @@ def lattice_for(sizes: Sequence[Sequence[int]] | Tensor) -> Lattice:
 
 DRAWN = 8
 """Times as many pixels as are wanted are drawn, before some are left out."""
+SOME = 16
+"""Images that are read where a data manager has none loaded."""
 TRIES = 100
 """Draws of a pixel that no mask hides: one in three fails where 1% of the pixels are seen."""
 
@@ -117,14 +120,9 @@ def sizes_of(pictures: Any) -> Tensor:
     return torch.tensor([picture.shape[:2] for picture in pictures])
 
 
-def some_numbers(dataset: Any, most: int = 16) -> Tensor:
-    """Numbers of up to so many images of a dataset, spread evenly: [P] int64."""
-    return torch.linspace(0, len(dataset) - 1, min(most, len(dataset))).long().unique()
-
-
 def some_images(dataset: Any) -> dict[str, Any]:
-    """A batch of `some_numbers` of the images of nerfstudio's `InputDataset`."""
-    chosen = some_numbers(dataset)
+    """A batch of up to `SOME` images of nerfstudio's `InputDataset`, spread evenly."""
+    chosen = chosen_cameras(len(dataset), SOME)
     read = [dataset.get_data(number) for number in chosen.tolist()]
     images = {key: [data[key] for data in read] for key in ("image", "mask") if key in read[0]}
     return images | {"image_idx": chosen}
