@@ -27,7 +27,7 @@ from leco_plugin.log import counted
 from leco_plugin.scenes.city.shapes import Array
 from leco_plugin.scenes.frames import SKEW, distance_from_rotations
 from leco_plugin.scenes.input_error import InputError, require_folder
-from leco_plugin.scenes.photograph_files import open_image
+from leco_plugin.scenes.photograph_files import header_of
 from leco_plugin.scenes.pt_file import describe, read_pt
 from leco_plugin.scenes.whole_files import write_whole
 
@@ -115,6 +115,9 @@ def wrong_axis(poses: Array) -> str | None:
 
 ENDINGS = (".jpg", ".JPG", ".png", ".PNG")
 """Of pictures, in the order in which Mega-NeRF looks for them."""
+KINDS = ("JPEG", "MPO", "PNG")
+"""By content, as Pillow calls them, which hands some others to other programs to decode them. MPO
+is a JPEG with a preview, as of a drone."""
 _MOST_PIXELS = 1 << 16
 """A side."""
 
@@ -234,7 +237,10 @@ def read_frame(metadata: Path, image: Path) -> Frame:
     intrinsics = _numbers(metadata, values, "intrinsics", (4,))
     if intrinsics[:2].min() <= 0:
         raise InputError(f"{metadata}: a focal length in intrinsics is not above 0")
-    size = open_image(image, pixels=False).size
+    header = header_of(image)
+    if header.format not in KINDS:
+        raise InputError(f"{image} is a file of {header.format}, and a picture is a JPEG or PNG")
+    size = header.size
     if abs(size[0] * height - size[1] * width) > max(width, height):
         raise InputError(
             f"{image} has {size[0]} x {size[1]} pixels, its metadata are for {width} x {height}"

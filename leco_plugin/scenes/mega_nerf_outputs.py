@@ -33,10 +33,9 @@ from leco_plugin.scenes.mega_nerf_files import Frame, MegaNerfScene, read_scene
 from leco_plugin.scenes.photograph_files import (
     DerivedImages,
     check_kind,
+    decode,
     header_of,
     is_plain,
-    open_image,
-    plain,
 )
 from leco_plugin.scenes.pt_file import describe, load, read_bytes
 
@@ -185,7 +184,7 @@ def picture_of(frame: Frame, factor: int, right_half: bool, derived: DerivedImag
         return frame.image
 
     def make() -> Image.Image:
-        image = plain(open_image(frame.image))
+        image = decode(frame.image, turn=False)
         if image.size != size:
             image = image.resize(size, Image.Resampling.LANCZOS)
         return image.crop((size[0] // 2, 0, *size)) if right_half else image
@@ -220,7 +219,7 @@ def mask_of(
 
     path = derived.get(source, f"{frame.width, frame.height} {size} {left_half}", make)
     # a mask that keeps nothing is kept as one pixel, so that its header says so
-    return None if open_image(path, pixels=False).size != size else path
+    return None if header_of(path).size != size else path
 
 
 def _cut(mask: Image.Image, left_half: bool) -> Image.Image:

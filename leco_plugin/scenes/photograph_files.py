@@ -268,18 +268,6 @@ class DerivedImages:
             raise InputError(f"{path} cannot be written ({why}); {self.remedy}") from None
 
 
-def open_image(path: Path, pixels: bool = True) -> Image.Image:
-    """A JPEG or PNG, with or without its pixels. InputError, in one line, if it is none."""
-    try:
-        # by content, whatever the name: Pillow hands some other kinds of files to other programs
-        with Image.open(path, formats=("JPEG", "PNG")) as image:
-            if pixels:
-                image.load()
-            return image
-    except Exception as error:  # noqa: BLE001  decoders raise whatever they meet
-        raise InputError(f"{path} cannot be read as a picture: {one_line(error, 120)}") from None
-
-
 HALF = 128
 """From this grey on, where a mask has so light ones, a pixel is seen."""
 COLOURED = 40

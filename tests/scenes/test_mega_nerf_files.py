@@ -124,7 +124,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "a picture that is none": (
         lambda s: (s / "train/rgbs/000003.png").write_bytes(b"\x89PNG"),
-        r"000003\.png cannot be read as a picture",
+        r"000003\.png cannot be read as an image",
     ),
 }
 

@@ -16,7 +16,7 @@ from scene_files import refused
 
 from leco_plugin.scenes.mega_nerf_files import Frame, read_scene
 from leco_plugin.scenes.mega_nerf_outputs import mask_of, picture_of, read_mask, scaled
-from leco_plugin.scenes.photograph_files import DerivedImages, open_image
+from leco_plugin.scenes.photograph_files import DerivedImages
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,7 @@ def derived(tmp_path: Path) -> DerivedImages:
 
 def pixels(path: Path | None) -> np.ndarray:
     assert path is not None
-    return np.array(open_image(path))
+    return np.array(Image.open(path))
 
 
 def test_a_picture_of_the_right_size_is_the_file_itself(
