@@ -8,9 +8,9 @@ from __future__ import annotations
 import logging
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Protocol, TextIO
+from typing import Protocol, TextIO, TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -18,6 +18,7 @@ from torch import distributed
 
 from leco_plugin.models.compute.ranks import is_first
 
+T, R = TypeVar("T"), TypeVar("R")
 SECONDS_TO_FIRST, SECONDS_A_LINE, SHARE_A_LINE = 10.0, 60.0, 0.05
 """To the first line without a terminal to draw a bar on, and between two lines: seconds, share."""
 OF_A_DEVICE = ("leco_plugin.samplers.kernels.fused", "leco_plugin.models.compute.grouped")
@@ -158,6 +159,16 @@ def bar(what: str) -> Iterator[Show]:
             in_file(share, figures)
 
         yield show
+
+
+def for_each(what: str, items: Sequence[T], make: Callable[[T], R]) -> list[R]:
+    """What `make` makes of each item, under a bar."""
+    made: list[R] = []
+    with bar(what) as show:
+        for item in items:
+            made.append(make(item))
+            show(len(made) / len(items))
+    return made
 
 
 class _Lines:

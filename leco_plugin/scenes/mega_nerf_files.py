@@ -12,7 +12,6 @@ both.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -23,7 +22,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from leco_plugin.log import counted
+from leco_plugin.log import counted, for_each
 from leco_plugin.scenes.city.shapes import Array
 from leco_plugin.scenes.frames import SKEW, distance_from_rotations
 from leco_plugin.scenes.input_error import InputError, require_folder
@@ -167,10 +166,8 @@ class MegaNerfScene:
         )
 
 
-def read_scene(
-    folder: Path, check_axes: bool = True, progress: Callable[[float], None] = lambda share: None
-) -> MegaNerfScene:
-    """Reads and checks everything but pixels; `progress` is told the share of files that are read.
+def read_scene(folder: Path, check_axes: bool = True) -> MegaNerfScene:
+    """Reads and checks everything but pixels.
 
     `check_axes` refuses a world whose first axis does not point down. InputError, in one line,
     names a file and what is wrong with it.
@@ -181,10 +178,7 @@ def read_scene(
     for (before, _), (after, _) in pairwise(pairs):
         if before.name == after.name:
             raise InputError(f"{before.name} is both in train/metadata and in val/metadata")
-    frames = []
-    for number, (metadata, image) in enumerate(pairs):
-        frames.append(read_frame(metadata, image))
-        progress((number + 1) / len(pairs))
+    frames = for_each("Reading the scene", pairs, lambda pair: read_frame(*pair))
     scene = MegaNerfScene(coordinates, frames)
     _check_rotations(folder, frames)
     fault = wrong_axis(scene.poses()) if check_axes else None

@@ -13,7 +13,6 @@ from __future__ import annotations
 import io
 import math
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +23,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from numpy.typing import NDArray
 from PIL import Image
 
-from leco_plugin.log import bar, note
+from leco_plugin.log import for_each, note
 from leco_plugin.scenes.coloured_points import points_in_model, read_cloud
 from leco_plugin.scenes.frames import ALTITUDES, METRES_PER_UNIT, UP_IS_KNOWN
 from leco_plugin.scenes.input_error import InputError, one_line, require_folder
@@ -56,8 +55,7 @@ def read(config: MegaNerfDataParserConfig) -> MegaNerfScene:
             )
     if config.masks is not None:
         require_folder(config.masks, "give one with masks, or leave --masks out")
-    with bar("Reading the scene") as progress:
-        scene = read_scene(config.data, config.check_axes, progress)
+    scene = read_scene(config.data, config.check_axes)
     note(scene.describe())
     for frame in scene.frames:  # now, and not after minutes of resizing for training
         if frame.split == "val":
@@ -91,7 +89,7 @@ def outputs_of(
     if training:
         frames, masks = _with_masks(config, frames, derived)
     right = half and not training
-    images = _for_each(
+    images = for_each(
         "Resizing the pictures", frames, lambda frame: picture_of(frame, factor, right, derived)
     )
     outputs = DataparserOutputs(
@@ -115,7 +113,7 @@ def _with_masks(
         folder = config.data / "masks"
     if folder is None and all(frame.split == "train" for frame in frames):
         return frames, None
-    found = _for_each(
+    found = for_each(
         "Unpacking the masks",
         frames,
         lambda frame: mask_of(frame, factor, frame.split == "val", folder, derived),
@@ -124,16 +122,6 @@ def _with_masks(
     if not seen:
         raise InputError(f"the masks in {folder} leave no pixel to train on")
     return [frame for frame, _ in seen], [mask for _, mask in seen]
-
-
-def _for_each(what: str, frames: list[Frame], make: Callable[[Frame], Any]) -> list[Any]:
-    """What `make` makes of each frame, under a progress bar."""
-    made = []
-    with bar(what) as progress:
-        for number, frame in enumerate(frames):
-            made.append(make(frame))
-            progress((number + 1) / len(frames))
-    return made
 
 
 def _cameras(scene: MegaNerfScene, frames: list[Frame], factor: int, right_half: bool) -> Cameras:

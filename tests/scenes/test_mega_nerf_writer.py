@@ -50,8 +50,8 @@ def test_a_camera_that_looks_down_is_written_as_the_format_says(tmp_path: Path) 
 def cities(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """The same city in both formats."""
     folder = tmp_path_factory.mktemp("cities")
-    ours = write_city(CITY, folder / "nerfstudio", CAPTURE, progress=False)
-    theirs = write_city(CITY, folder / "mega", CAPTURE, progress=False, layout="mega-nerf")
+    ours = write_city(CITY, folder / "nerfstudio", CAPTURE)
+    theirs = write_city(CITY, folder / "mega", CAPTURE, layout="mega-nerf")
     return ours, theirs
 
 

@@ -155,8 +155,8 @@ def cities(tmp_path_factory: pytest.TempPathFactory) -> dict[str, SimpleNamespac
     folder = tmp_path_factory.mktemp("cities")
     capture = CaptureConfig(24, 18, aerial_per_block=6.0, street_per_block=0.0)
     city = CityConfig(blocks=2)
-    plain = write_city(city, folder / "plain", capture, progress=False)
-    mega = write_city(city, folder / "mega", capture, progress=False, layout="mega-nerf")
+    plain = write_city(city, folder / "plain", capture)
+    mega = write_city(city, folder / "mega", capture, layout="mega-nerf")
     upright = LecoPhotographsDataParserConfig(data=plain).setup().get_dataparser_outputs("train")
     transform, scale = upright.dataparser_transform, upright.dataparser_scale
     in_metres = (upright.metadata[POINTS] / scale - transform[:, 3]) @ transform[:, :3]

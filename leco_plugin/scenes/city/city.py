@@ -265,7 +265,7 @@ def _halves(rectangles: Array, direction: NDArray[np.int64]) -> Array:
 
 def read_description(folder: Path) -> dict[str, Any]:
     """Reads and checks a folder's `city.json`. ValueError or OSError, in one line, if it is bad."""
-    path = Path(folder) / DESCRIPTION
+    path = folder / DESCRIPTION
     if not path.is_file():
         raise FileNotFoundError(f"{folder} holds no city: there is no {DESCRIPTION}")
     try:

@@ -36,6 +36,7 @@ from PIL import Image
 from torch import Tensor
 
 import leco_plugin
+from leco_plugin.log import for_each
 from leco_plugin.scenes.city.cameras import CaptureConfig, Lens, View, views_of
 from leco_plugin.scenes.city.city import DESCRIPTION, City, CityConfig, read_description
 from leco_plugin.scenes.input_error import InputError, one_line
@@ -173,20 +174,17 @@ def with_alpha(image: Image8, depth: NDArray[np.floating]) -> Image8:
 
 def write_city(
     config: CityConfig,
-    out_dir: Path | str,
-    capture: CaptureConfig | None = None,
-    progress: bool = True,
+    out_dir: Path,
+    capture: CaptureConfig,
     layout: LayoutName = "nerfstudio",
 ) -> Path:
     """Writes the city as a scene into `out_dir`, unless it already holds just that; returns it.
 
     The folder appears under its name only when it is complete. Until then the pictures lie in a
     hidden folder beside it; a run that was killed is taken up there, and several may work on it.
-    Without `capture` there are about 60 small aerial pictures for 3 blocks. FileExistsError if
-    `out_dir` holds something else, ValueError if it holds a damaged city or cannot be replaced; all
-    leave it alone.
+    FileExistsError if `out_dir` holds something else, ValueError if it holds a damaged city or
+    cannot be replaced; all leave it alone.
     """
-    out_dir, capture = Path(out_dir), capture or CaptureConfig()
     parts = {"city": dataclasses.asdict(config), "capture": dataclasses.asdict(capture)}
     wanted = {"format": 1, **parts, "layout": layout}
     text = json.dumps(wanted, indent=2) + "\n"
@@ -204,7 +202,7 @@ def write_city(
     with writing_into(out_dir, "--out"):
         unfinished.mkdir(parents=True, exist_ok=True)
     try:
-        _photograph(city, files, unfinished, progress)
+        _photograph(city, files, unfinished)
         files.finish(unfinished)
         write_whole(unfinished / DESCRIPTION, lambda file: file.write(text.encode()))
         unfinished.replace(place)
@@ -217,10 +215,8 @@ def write_city(
     return out_dir
 
 
-def _photograph(city: City, layout: Layout, folder: Path, progress: bool) -> None:
+def _photograph(city: City, layout: Layout, folder: Path) -> None:
     """Takes the pictures that are not there yet, one by one."""
-    from rich.progress import track
-
     from leco_plugin.scenes.city.render import Tracer
 
     def missing(view: View) -> bool:
@@ -231,12 +227,14 @@ def _photograph(city: City, layout: Layout, folder: Path, progress: bool) -> Non
         return
     tracer, count = Tracer(city), len(layout.views)
     there = f" ({count - len(wanted)} of {count} are there)" if len(wanted) < count else ""
-    what = f"Photographing the city{there}"
-    for view in track(wanted, what, transient=True, disable=not progress):
+
+    def take(view: View) -> None:
         if missing(view):  # another process may work on the same city
             image, depth = tracer.photograph(view.pose, layout.lens)
             image = image if city.config.sky else with_alpha(image, depth)
             layout.write(folder, view, image, depth)
+
+    for_each(f"Photographing the city{there}", wanted, take)
 
 
 def _holds(folder: Path, wanted: dict[str, Any]) -> bool:
@@ -312,10 +310,9 @@ class CityTruth:
     """Model units in a metre."""
 
     @classmethod
-    def from_dataparser(cls, folder: Path | str, outputs: Any) -> CityTruth:
+    def from_dataparser(cls, folder: Path, outputs: Any) -> CityTruth:
         """From a city's folder and nerfstudio's `DataparserOutputs` for it. ValueError or OSError
         if the folder holds no city."""
-        folder = Path(folder)
         transform = outputs.dataparser_transform.double().cpu()
         if read_description(folder)["layout"] == "mega-nerf":
             turn = torch.from_numpy(TO_DRB)  # that reader begins at (down, right, back)

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from leco_plugin.log import bar
+from leco_plugin.log import for_each
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.whole_files import write_whole
 from leco_plugin.studio.host_models import outputs_of
@@ -77,11 +77,12 @@ def store_pictures(dataset: Any, folder: Path, what: str = "photographs") -> dic
     files = {"image": [folder / f"{name}.pixels" for name in names]}
     if masked:
         files["mask"] = [folder / f"{name}.mask" for name in names]
-    with bar(f"Decoding the {what}") as progress:
-        for number in range(len(dataset)):
-            if not all(made[number].is_file() for made in files.values()):
-                _decode(dataset, number, sizes[number].tolist(), files)
-            progress((number + 1) / len(dataset))
+
+    def store(number: int) -> None:
+        if not all(made[number].is_file() for made in files.values()):
+            _decode(dataset, number, sizes[number].tolist(), files)
+
+    for_each(f"Decoding the {what}", range(len(dataset)), store)
     pixels = sizes.prod(dim=-1).tolist()
     stored: dict[str, Any] = {
         kind: StoredPictures(made, sizes, _channels(made, pixels)) for kind, made in files.items()

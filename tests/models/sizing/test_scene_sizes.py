@@ -253,7 +253,7 @@ def test_a_wrong_size_ends_a_command_with_one_line() -> None:
 def city(folder: Path, blocks: int) -> tuple[SceneDetail, int]:
     """Detail of a drone survey of a city, and its number of photographs."""
     capture = CaptureConfig(12, 9, street_per_block=0.0)
-    write_city(CityConfig(blocks), folder, capture, progress=False)
+    write_city(CityConfig(blocks), folder, capture)
     parser = LecoPhotographsDataParserConfig(data=folder, downscale_factor=1)
     outputs = parser.setup().get_dataparser_outputs("train")
     outputs.cameras.rescale_output_resolution(160 / 12)  # the poses are the same at every size

@@ -29,7 +29,7 @@ CAPTURE = CaptureConfig(40, 30, aerial_per_block=6, street_per_block=3, test_eve
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_city(CITY, tmp_path_factory.mktemp("scenes") / "city", CAPTURE, progress=False)
+    return write_city(CITY, tmp_path_factory.mktemp("scenes") / "city", CAPTURE)
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def copy(folder: Path, tmp_path: Path) -> Path:
 def mega_nerf(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same city in Mega-NeRF's format."""
     place = tmp_path_factory.mktemp("scenes") / "city"
-    return write_city(CITY, place, CAPTURE, progress=False, layout="mega-nerf")
+    return write_city(CITY, place, CAPTURE, layout="mega-nerf")
 
 
 def test_the_city_is_rebuilt_from_its_folder(folder: Path) -> None:
@@ -118,7 +118,7 @@ def test_a_damaged_folder_gets_one_line(copy: Path, damage: str) -> None:
 
 
 KILLED = """
-import os, signal, sys
+import os, pathlib, signal, sys
 from leco_plugin.scenes.city.city import CityConfig
 from leco_plugin.scenes.city.folder import CaptureConfig, write_city
 from leco_plugin.scenes.city.render import Tracer
@@ -140,7 +140,7 @@ for layout in sys.argv[2:]:
     os.mkdir(sys.argv[1] + "/" + layout)
     if (child := os.fork()) == 0:
         sys.argv[1] += "/" + layout
-        write_city(config, sys.argv[1] + "/city", capture, False, layout)
+        write_city(config, pathlib.Path(sys.argv[1], "city"), capture, layout)
         os._exit(0)
     print(os.WTERMSIG(os.waitpid(child, 0)[1]))
 """
@@ -175,9 +175,9 @@ def test_a_killed_run_is_taken_up_where_it_ended(
         return photograph(self, *arguments)
 
     monkeypatch.setattr(Tracer, "photograph", count)
-    resumed = write_city(CITY, folder / "city", CAPTURE, progress=False, layout=layout)
+    resumed = write_city(CITY, folder / "city", CAPTURE, layout=layout)
     assert len(taken) == 9 - 3
-    whole = write_city(CITY, folder / "other", CAPTURE, progress=False, layout=layout)
+    whole = write_city(CITY, folder / "other", CAPTURE, layout=layout)
     assert [path.name for path in folder.iterdir() if path.name.startswith(".")] == []
     assert contents(resumed) == contents(whole)
 
@@ -195,7 +195,7 @@ def test_a_city_is_written_into_the_folder_that_a_link_leads_to(
     (tmp_path / "there").mkdir()
     one = CaptureConfig(8, 8, aerial_per_block=2, street_per_block=0)
     for name in ("there", "not_yet"):
-        assert write_city(CITY, tmp_path / f"to_{name}", one, False) == tmp_path / f"to_{name}"
+        assert write_city(CITY, tmp_path / f"to_{name}", one) == tmp_path / f"to_{name}"
         assert count_pictures(tmp_path / name) == (2, 1)
 
 
@@ -219,16 +219,13 @@ def test_an_interrupted_write_keeps_what_it_has_out_of_sight(
 
     monkeypatch.setattr(Tracer, "photograph", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        write_city(CITY, tmp_path / "city", CAPTURE, progress=False)
+        write_city(CITY, tmp_path / "city", CAPTURE)
     assert all(path.name.startswith(".city-unfinished-") for path in tmp_path.iterdir())
 
 
 def test_two_processes_that_write_one_city_help_each_other(tmp_path: Path) -> None:
     with ThreadPoolExecutor(2) as pool:
-        runs = [
-            pool.submit(write_city, CITY, tmp_path / "city", CAPTURE, progress=False)
-            for _ in range(2)
-        ]
+        runs = [pool.submit(write_city, CITY, tmp_path / "city", CAPTURE) for _ in range(2)]
         folders = [run.result() for run in runs]
     assert folders == 2 * [tmp_path / "city"]
     assert [path.name for path in tmp_path.iterdir()] == ["city"]
@@ -250,7 +247,7 @@ def test_no_picture_stays_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         return image, watched
 
     monkeypatch.setattr(Tracer, "photograph", watch)
-    write_city(CITY, tmp_path / "city", CAPTURE, progress=False)
+    write_city(CITY, tmp_path / "city", CAPTURE)
     assert len(most) == 9 and max(most) <= 1
 
 
