@@ -130,8 +130,6 @@ FILMS = (".mp4", ".mov", ".avi", ".mkv", ".m4v")
 COPIED = {"JPEG": (".jpg", ".jpeg"), "MPO": (".jpg", ".jpeg"), "PNG": (".png",)}
 """Kinds, by Pillow's name, that are copied byte by byte where their colours need no change and
 their names end so: pycolmap reads no other."""
-SCAN, DESCRIPTIONS = 0xDA, (*range(0xE0, 0xF0), 0xFE)
-"""Markers in a JPEG: where pixels begin, and segments of applications, EXIF's, and comments."""
 FEWEST = 3
 LONGEST, MOST_BYTES = 80, 240
 """Letters and bytes of a copy's name, its last ones: it may have 255 bytes, with a number before it
@@ -151,6 +149,8 @@ class Photograph:
     """Of its copy in the scene: no blanks and no folders."""
     header: Header
     exif: Exif
+    described: int = 0
+    """Bytes of a JPEG that say something of its picture, as EXIF and comments do."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -161,7 +161,7 @@ class Photograph:
     @property
     def content(self) -> tuple[object, ...]:
         """The same of the same picture with the same lens, whatever its GPS."""
-        length = self.path.stat().st_size - described_bytes(self.path)
+        length = self.path.stat().st_size - self.described
         return self.name, length, self.size, self.header.orientation, self.exif[2:]
 
     @property
@@ -174,22 +174,6 @@ class Photograph:
         """Whether the copy has the bytes of the original."""
         upright = self.header.orientation == 1 and is_plain(self.header)
         return upright and self.path.suffix.lower() in COPIED.get(self.header.format, ())
-
-
-def described_bytes(path: Path) -> int:
-    """Bytes of a JPEG that say something of its picture, as EXIF does; 0 of other kinds."""
-    found = 0
-    with path.open("rb") as file:
-        if file.read(2) != b"\xff\xd8":
-            return 0
-        while len(head := file.read(4)) == 4 and head[0] == 0xFF and head[1] != SCAN:
-            if head[1] == 0xFF:  # a marker may be filled up in front
-                file.seek(-3, os.SEEK_CUR)
-                continue
-            length = int.from_bytes(head[2:], "big")
-            found += 2 + length if head[1] in DESCRIPTIONS else 0
-            file.seek(length - 2, os.SEEK_CUR)
-    return found
 
 
 class Found(NamedTuple):
@@ -300,10 +284,11 @@ def _read(path: Path, folder: Path) -> Photograph:
             raise InputError(f"{path} is HEIC: {remedy}") from None
         check_kind(path, header)
         with Image.open(path) as image:
-            exif = read_exif(image)
+            exif, segments = read_exif(image), getattr(image, "applist", ())
     name = re.sub(r"[^\w.\-]+", "_", "_".join(path.relative_to(folder).parts))[-LONGEST:]
     name = name.encode()[-MOST_BYTES:].decode(errors="ignore")
-    photograph = Photograph(path, name, header, exif)
+    described = sum(4 + len(segment) for _, segment in segments)  # a marker, and its length
+    photograph = Photograph(path, name, header, exif, described)
     suffix = path.suffix.lower()
     if photograph.is_copied or (suffix in COPIED["JPEG"] and not header.transparent):
         return photograph
