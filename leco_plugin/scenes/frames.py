@@ -238,7 +238,7 @@ DOWN, MOSTLY = -0.3, 0.9
 """Height of a unit vector that goes down, and the share of cameras of a survey that look so."""
 ABOVE = 0.75
 """Share of a survey's cameras that are above nearly all points."""
-FLAT = 0.35
+LAYER = 0.35
 """Thickness of the ground, and of the layer in which cameras fly, of its lesser width."""
 TURNED, LEVEL = 0.3, 0.15
 """Cosines (root mean square) of the cameras' right axes with the second direction in which they
@@ -317,7 +317,7 @@ def _spreads(places: Tensor) -> tuple[Tensor, Tensor]:
 def _normal_of_layer(places: Tensor) -> Tensor | None:
     """The direction [3] across places [N, 3] that lie in a flat layer."""
     spreads, axes = _spreads(places)
-    return axes[:, 0] if bool(spreads[0] < FLAT * spreads[1]) else None
+    return axes[:, 0] if bool(spreads[0] < LAYER * spreads[1]) else None
 
 
 def _vertical_of(rights: Tensor) -> Tensor | None:
