@@ -23,8 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from leco_plugin.evaluation.report import read_object
 from leco_plugin.scenes.input_error import InputError, one_line
-from leco_plugin.scenes.locks import LOCK, alone_in, writing_into
-from leco_plugin.scenes.whole_files import write_json
+from leco_plugin.scenes.whole_files import LOCK, alone_in, write_json, writing_into
 
 if TYPE_CHECKING:
     from leco_plugin.chart.contender import Job

@@ -26,8 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from leco_plugin.log import bar, counted, resumable
 from leco_plugin.scenes.input_error import InputError, one_line, require_folder
-from leco_plugin.scenes.locks import alone_in
-from leco_plugin.scenes.whole_files import remove_parts, write_json, write_whole
+from leco_plugin.scenes.whole_files import alone_in, remove_parts, write_json, write_whole
 
 Array = NDArray[np.float64]
 SCENE, READ = "transforms.json", "leco-rays"

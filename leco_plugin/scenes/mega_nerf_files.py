@@ -24,7 +24,7 @@ from PIL import Image
 
 from leco_plugin.log import counted, for_each
 from leco_plugin.scenes.city.shapes import Array
-from leco_plugin.scenes.frames import SKEW, distance_from_rotations
+from leco_plugin.scenes.frames import check_poses
 from leco_plugin.scenes.input_error import InputError, require_folder
 from leco_plugin.scenes.photograph_files import header_of
 from leco_plugin.scenes.pt_file import describe, read_pt
@@ -180,7 +180,13 @@ def read_scene(folder: Path, check_axes: bool = True) -> MegaNerfScene:
             raise InputError(f"{before.name} is both in train/metadata and in val/metadata")
     frames = for_each("Reading the scene", pairs, lambda pair: read_frame(*pair))
     scene = MegaNerfScene(coordinates, frames)
-    _check_rotations(folder, frames)
+    names = [f"{metadata}: c2w" for metadata, _ in pairs]
+    if (np.linalg.det(scene.poses()[:, :, :3]) < 0).all():
+        raise InputError(
+            f"{names[0]} is mirrored, as in all files: the axes of its world are not "
+            "(down, right, back), perhaps the first one points up"
+        )
+    check_poses(scene.poses(), names)
     fault = wrong_axis(scene.poses()) if check_axes else None
     if fault is not None:
         raise InputError(
@@ -292,22 +298,6 @@ def _side(path: Path, values: dict[str, Any], name: str) -> int:
     if not (1 <= value <= _MOST_PIXELS and value == int(value)):
         raise InputError(f"{path}: {name} is {value:g}, and not a number of pixels")
     return int(value)
-
-
-def _check_rotations(folder: Path, frames: list[Frame]) -> None:
-    rotations = np.stack([frame.pose[:, :3] for frame in frames])
-    errors = distance_from_rotations(rotations)
-    worst = int(errors.argmax())
-    if errors[worst] <= SKEW:
-        return
-    frame = frames[worst]
-    metadata = folder / frame.split / "metadata" / f"{frame.stem}.pt"
-    if (np.linalg.det(rotations) < 0).all():
-        raise InputError(
-            f"{metadata}: c2w is mirrored, as in all files: the axes of its world are not "
-            "(down, right, back), perhaps the first one points up"
-        )
-    raise InputError(f"{metadata}: c2w is no rotation and position")
 
 
 def write_coordinates(folder: Path, coordinates: Coordinates) -> None:

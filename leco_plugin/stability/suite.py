@@ -29,9 +29,8 @@ from leco_plugin.log import bar, by_number, counted, put, resumable, spell
 from leco_plugin.occupancy import CALIBRATED_AT
 from leco_plugin.scenes.city.folder import TRANSFORMS
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.locks import alone_in
 from leco_plugin.scenes.photographs import describe_scene
-from leco_plugin.scenes.whole_files import write_json
+from leco_plugin.scenes.whole_files import alone_in, write_json
 from leco_plugin.stability.cases import Case, cases_named
 from leco_plugin.stability.photographs import digest_of, write_scene
 from leco_plugin.stability.plan import (

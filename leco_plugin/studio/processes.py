@@ -21,7 +21,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from leco_plugin.log import say
 from leco_plugin.scenes.input_error import InputError, TrainingStopped
-from leco_plugin.scenes.locks import writing_into
+from leco_plugin.scenes.whole_files import writing_into
 from leco_plugin.studio.checkpoints import follow_data
 from leco_plugin.studio.run_folder import OUTPUT, claim
 from leco_plugin.studio.run_progress import is_short, short_screen

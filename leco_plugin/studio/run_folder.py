@@ -27,8 +27,7 @@ from leco_plugin.log import counted
 from leco_plugin.models.compute.ranks import is_first
 from leco_plugin.models.sizing.sizes import sizes_in, sizes_to_resume
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.locks import lock, unlock, writing_into
-from leco_plugin.scenes.whole_files import write_whole
+from leco_plugin.scenes.whole_files import lock, unlock, write_whole, writing_into
 from leco_plugin.studio.checkpoints import (
     allow_checkpoint_globals,
     damage_of,

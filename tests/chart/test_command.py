@@ -18,7 +18,7 @@ from leco_plugin.chart.chart import Chart
 from leco_plugin.chart.contender import Job, Protocol
 from leco_plugin.chart.methods import AT_ONCE, SUITES
 from leco_plugin.chart.runner import UNFINISHED, ProcessRunner, RunFailed
-from leco_plugin.scenes.locks import alone_in
+from leco_plugin.scenes.whole_files import alone_in
 
 ONE = ["--methods", "leco-occupancy"]
 METHODS = [*ONE, "leco-occupancy-never-frozen"]

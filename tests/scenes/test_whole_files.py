@@ -14,7 +14,7 @@ from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.coloured_points import read_cloud
 from leco_plugin.scenes.photograph_files import header_of
 from leco_plugin.scenes.pt_file import read_pt
-from leco_plugin.scenes.whole_files import PART, check_place, remove_parts, write_whole
+from leco_plugin.scenes.whole_files import PART, alone_in, check_place, remove_parts, write_whole
 from leco_plugin.space import Space
 
 
@@ -87,3 +87,21 @@ def test_two_threads_may_save_one_occupancy_at_once(
     occupancy.save(path)
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
     assert Occupancy.load(path).threshold == 0.5
+
+
+def test_a_folder_that_cannot_be_written_is_named_with_the_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, *_: int) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    def not_written(name: str, why: str) -> None:
+        line = rf"into .*{name} \({why}\): name another folder with --out$"
+        with refused(line), alone_in(tmp_path / name, "scene"):
+            raise AssertionError
+
+    (tmp_path / "file").touch()
+    not_written("file", "File exists")
+    not_written("file/scene", "Not a directory")
+    monkeypatch.setattr(os, "open", refuse)
+    not_written("read_only", "Permission denied")

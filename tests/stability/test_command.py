@@ -10,7 +10,7 @@ import pytest
 from stability_runs import TINY, Runs
 
 from leco_plugin import cli
-from leco_plugin.scenes.locks import alone_in
+from leco_plugin.scenes.whole_files import alone_in
 from leco_plugin.stability import suite
 
 

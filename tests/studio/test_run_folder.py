@@ -12,7 +12,7 @@ import pytest
 from forked_commands import ForkedCommands
 
 from leco_plugin.method_configs import leco_occupancy
-from leco_plugin.scenes import locks
+from leco_plugin.scenes import whole_files
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.studio.run_folder import claim, release
 
@@ -62,34 +62,34 @@ def test_a_run_that_ends_by_itself_leaves_no_lock_and_one_that_has_it_keeps_it(
     assert claim(folder, folder / "checkpoints", None) is None
     refused = command("python", tmp_path / "hold.py", folder)
     assert "another run is going on" in refused
-    assert [path.name for path in folder.iterdir()] == [locks.LOCK]
+    assert [path.name for path in folder.iterdir()] == [whole_files.LOCK]
     release(folder)
     assert list(folder.iterdir()) == []
 
 
 def test_a_lock_that_goes_away_is_made_anew(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder.mkdir()
-    flock, opened = locks.fcntl.flock, []
+    flock, opened = whole_files.fcntl.flock, []
 
     def late(held: int, how: int) -> None:
         opened.append(held)
         if len(opened) == 1:  # who held it ends between this one's opening and locking
-            (folder / locks.LOCK).unlink()
+            (folder / whole_files.LOCK).unlink()
         flock(held, how)
 
-    monkeypatch.setattr(locks.fcntl, "flock", late)
-    held = locks.lock(folder)
+    monkeypatch.setattr(whole_files.fcntl, "flock", late)
+    held = whole_files.lock(folder)
     assert len(opened) == 2 and held is not None
-    assert os.path.samestat(os.stat(folder / locks.LOCK), os.fstat(held))
-    assert locks.lock(folder) is None
+    assert os.path.samestat(os.stat(folder / whole_files.LOCK), os.fstat(held))
+    assert whole_files.lock(folder) is None
     os.close(held)
 
 
 def test_a_lock_holds_on_odd_file_systems(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder.mkdir()
-    monkeypatch.setattr(locks, "_lies_in", lambda *_: False)
-    held = locks.lock(folder)
-    assert held is not None and locks.lock(folder) is None
+    monkeypatch.setattr(whole_files, "_lies_in", lambda *_: False)
+    held = whole_files.lock(folder)
+    assert held is not None and whole_files.lock(folder) is None
     os.close(held)
 
 

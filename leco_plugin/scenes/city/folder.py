@@ -40,7 +40,6 @@ from leco_plugin.log import for_each
 from leco_plugin.scenes.city.cameras import CaptureConfig, Lens, View, views_of
 from leco_plugin.scenes.city.city import DESCRIPTION, City, CityConfig, read_description
 from leco_plugin.scenes.input_error import InputError, one_line
-from leco_plugin.scenes.locks import writing_into
 from leco_plugin.scenes.mega_nerf_files import (
     TO_DRB,
     Coordinates,
@@ -50,7 +49,13 @@ from leco_plugin.scenes.mega_nerf_files import (
     write_mappings,
     write_view,
 )
-from leco_plugin.scenes.whole_files import remove_parts, write_json, write_points, write_whole
+from leco_plugin.scenes.whole_files import (
+    remove_parts,
+    write_json,
+    write_points,
+    write_whole,
+    writing_into,
+)
 
 Image8 = NDArray[np.uint8]
 LayoutName = Literal["nerfstudio", "mega-nerf"]

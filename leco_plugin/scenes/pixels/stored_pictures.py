@@ -14,12 +14,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from leco_plugin.log import for_each
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.whole_files import write_whole
+from leco_plugin.scenes.whole_files import write_whole, writing_into
 from leco_plugin.studio.host_models import outputs_of
 
 
@@ -118,17 +117,9 @@ def _decode(dataset: Any, number: int, size: list[int], files: dict[str, list[Pa
         )
     for kind, made in files.items():
         values = data[kind].numpy()
-        _write(made[number], (values > 0).astype(np.uint8) * 255 if kind == "mask" else values)
-
-
-def _write(path: Path, values: NDArray[np.uint8]) -> None:
-    try:
-        write_whole(path, lambda file: file.write(values.tobytes()))
-    except OSError as error:
-        raise InputError(
-            f"decoded photographs cannot be written to {path.parent} "
-            f"({error.strerror}); give another folder with --pipeline.datamanager.pixels"
-        ) from None
+        stored = ((values > 0).astype(np.uint8) * 255 if kind == "mask" else values).tobytes()
+        with writing_into(made[number].parent, "--pipeline.datamanager.pixels"):
+            write_whole(made[number], lambda file, stored=stored: file.write(stored))  # type: ignore[misc]
 
 
 def _channels(files: list[Path], pixels: list[int]) -> int:

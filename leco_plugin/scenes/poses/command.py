@@ -13,7 +13,6 @@ import numpy as np
 
 from leco_plugin.log import bar, resumable
 from leco_plugin.scenes.input_error import InputError, one_line
-from leco_plugin.scenes.locks import alone_in
 from leco_plugin.scenes.poses import ASKED
 from leco_plugin.scenes.poses import georeference as world
 from leco_plugin.scenes.poses.georeference import MODEL, POINTS, Placement, points_of, poses_of
@@ -29,7 +28,7 @@ from leco_plugin.scenes.poses.reconstruction import (
     require_disk,
 )
 from leco_plugin.scenes.scene_file import NO_SCENE, load_json
-from leco_plugin.scenes.whole_files import remove_parts, write_json
+from leco_plugin.scenes.whole_files import alone_in, remove_parts, write_json
 
 REPORT = "poses.json"
 """In the folder of the scene: what came of what was asked for."""

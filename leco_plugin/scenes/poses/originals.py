@@ -20,9 +20,9 @@ from typing import Any, NamedTuple, TypeVar
 from PIL import ExifTags, Image
 
 from leco_plugin.log import by_number, counted
-from leco_plugin.scenes.input_error import InputError, one_line, require_folder
+from leco_plugin.scenes.input_error import InputError, require_folder
 from leco_plugin.scenes.photograph_files import Header, check_kind, decode, header_of, is_plain
-from leco_plugin.scenes.whole_files import write_whole
+from leco_plugin.scenes.whole_files import write_whole, writing_into
 
 T = TypeVar("T")
 Position = tuple[float, float, float]
@@ -313,7 +313,7 @@ def copy_photographs(found: Found, folder: Path, show: Callable[[float], None]) 
 
 
 def _write(photograph: Photograph, image: Image.Image, path: Path) -> None:
-    try:
+    with writing_into(path.parent, "--out"):
         if photograph.is_copied:
             with photograph.path.open("rb") as source:
                 write_whole(path, lambda file: shutil.copyfileobj(source, file))
@@ -322,8 +322,6 @@ def _write(photograph: Photograph, image: Image.Image, path: Path) -> None:
         options: dict[str, Any] = {"exif": _upright_exif(image, kind)}
         options |= {} if kind == "PNG" else {"quality": QUALITY, "subsampling": 0}
         write_whole(path, lambda file: image.save(file, kind, **options))
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {one_line(error, 120)}") from None
 
 
 def _upright_exif(image: Image.Image, kind: str) -> bytes:

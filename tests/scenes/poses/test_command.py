@@ -25,11 +25,11 @@ from scene_files import read_ply
 
 from leco_plugin import cli
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.locks import alone_in
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 from leco_plugin.scenes.poses import command
 from leco_plugin.scenes.poses.command import _report, make_scene, summary
 from leco_plugin.scenes.poses.georeference import Placement
+from leco_plugin.scenes.whole_files import alone_in
 
 pytestmark = pytest.mark.xdist_group("poses")
 
