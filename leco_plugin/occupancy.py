@@ -204,7 +204,7 @@ class Occupancy(nn.Module):
 
         # not save_file: that leaves a file which only its owner can read
         content = save(tensors, metadata=header)
-        write_whole(path, lambda file: file.write(content))
+        write_whole(path, content)
 
     @classmethod
     def load(cls, path: str | Path, device: str | torch.device = "cpu") -> Occupancy:

@@ -140,7 +140,7 @@ def write_page_file(figure: Any, path: Path, title: str) -> Path:
     """Writes a figure of plotly as a page: 2 MB for the library, which take 5 MB as they are."""
     parts = {"library": _library(), "shown": _pack(figure.to_json())}
     page = PAGE.format(title=html.escape(title), **parts).encode()
-    write_whole(path, lambda file: file.write(page))
+    write_whole(path, page)
     return path
 
 

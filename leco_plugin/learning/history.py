@@ -133,7 +133,7 @@ class GateHistory:
         for name in self.weights[0]:
             tensors[f"gate.{name}"] = torch.stack([state[name] for state in self.weights])
         path = folder / FILE_NAME
-        write_whole(path, lambda file: file.write(save(tensors, metadata={"format": FORMAT})))
+        write_whole(path, save(tensors, metadata={"format": FORMAT}))
         return path
 
     def leave(self, folder: Path) -> None:

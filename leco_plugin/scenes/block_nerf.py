@@ -233,7 +233,7 @@ def _read(path: Path, out: Path) -> Iterator[tuple[Any, ...]]:
                 if len(record := file.read(length)) < length:
                     raise ValueError("a record that is cut off")
                 name, png, *row = _picture(_fields(record))
-                write_whole(out / f"images/{name}.png", lambda to, png=png: to.write(png))  # type: ignore[misc]
+                write_whole(out / f"images/{name}.png", png)
                 yield (name, *row[:3], "validation" in path.name, *row[3:])
                 file.read(4)
             if not file.tell():

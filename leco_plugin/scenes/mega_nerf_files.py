@@ -312,7 +312,7 @@ def write_coordinates(folder: Path, coordinates: Coordinates) -> None:
 def write_mappings(folder: Path, stems: dict[str, str]) -> None:
     """Writes `mappings.txt` from the original names of pictures and their stems."""
     text = "".join(f"{name},{stem}.pt\n" for name, stem in stems.items())
-    write_whole(folder / "mappings.txt", lambda file: file.write(text.encode()))
+    write_whole(folder / "mappings.txt", text.encode())
 
 
 def write_view(

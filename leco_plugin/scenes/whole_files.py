@@ -28,15 +28,15 @@ FETCH = "is a pointer of Git LFS: `git lfs pull` fetches the file"
 """What to say of a file that `is_pointer`."""
 
 
-def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Lets `write` fill a file beside `path`, and moves it there; folders are made. Of several
-    processes at once the last one wins."""
+def write_whole(path: Path, content: bytes | Callable[[BinaryIO], object]) -> None:
+    """Writes bytes, or what a function writes into a file, beside `path` and moves it there;
+    folders are made. Of several processes at once the last one wins."""
     path.parent.mkdir(parents=True, exist_ok=True)
     known = f"{path.name[-LONGEST:]}.{os.getpid()}-{threading.get_ident()}"
     part = path.with_name(f".{known}{PART}")
     try:
         with part.open("wb") as file:
-            write(file)
+            file.write(content) if isinstance(content, bytes) else content(file)
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
@@ -59,7 +59,7 @@ def write_json(path: Path, value: Any, indent: int = 2, allow_nan: bool = False)
     """Writes JSON whole or not at all; folders are made. NaN and infinity raise ValueError unless
     allowed."""
     text = json.dumps(value, indent=indent, allow_nan=allow_nan) + "\n"
-    write_whole(path, lambda file: file.write(text.encode()))
+    write_whole(path, text.encode())
 
 
 def write_report(path: Path | None, value: Any) -> None:
@@ -89,7 +89,7 @@ def write_points(
     properties += [f"property uchar {c}" for c in ("red", "green", "blue", "alpha")[:channels]]
     head = ["ply", "format binary_little_endian 1.0", *(f"comment {each}" for each in comments)]
     head += [f"element vertex {len(rows)}", *properties, "end_header\n"]
-    write_whole(path, lambda file: file.write("\n".join(head).encode() + rows.tobytes()))
+    write_whole(path, "\n".join(head).encode() + rows.tobytes())
 
 
 def check_place(option: str, path: Path | None) -> None:

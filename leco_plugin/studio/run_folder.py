@@ -122,7 +122,7 @@ def keep_sizes(config: Any, model: Any, asked: Any) -> Any:
     if is_first() and path.exists():  # what is not to be stored has none
         text = yaml.dump(config)
         with writing_into(path.parent, OUTPUT):
-            write_whole(path, lambda file: file.write(text.encode("utf8")))
+            write_whole(path, text.encode("utf8"))
     return config
 
 

@@ -21,14 +21,14 @@ from leco_plugin.space import Space
 def test_a_file_replaces_the_old_one_and_makes_its_folder(tmp_path: Path) -> None:
     path = tmp_path / "new" / "file"
     for text in (b"one", b"two"):
-        write_whole(path, lambda file, text=text: file.write(text))
+        write_whole(path, text)
         assert path.read_bytes() == text
     assert [p.name for p in path.parent.iterdir()] == ["file"]
 
 
 def test_a_file_may_have_the_longest_name_that_there_is(tmp_path: Path) -> None:
     path = tmp_path / ("\u6d77" * 83 + ".jpg")  # 253 bytes of 255
-    write_whole(path, lambda file: file.write(b"whole"))
+    write_whole(path, b"whole")
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 

@@ -209,7 +209,7 @@ def write_city(
     try:
         _photograph(city, files, unfinished)
         files.finish(unfinished)
-        write_whole(unfinished / DESCRIPTION, lambda file: file.write(text.encode()))
+        write_whole(unfinished / DESCRIPTION, text.encode())
         unfinished.replace(place)
         remove_parts(out_dir)  # not before: who loses a part to another finds the city there
     except OSError:

@@ -117,9 +117,9 @@ def _decode(dataset: Any, number: int, size: list[int], files: dict[str, list[Pa
         )
     for kind, made in files.items():
         values = data[kind].numpy()
-        stored = ((values > 0).astype(np.uint8) * 255 if kind == "mask" else values).tobytes()
+        values = (values > 0).astype(np.uint8) * 255 if kind == "mask" else values
         with writing_into(made[number].parent, "--pipeline.datamanager.pixels"):
-            write_whole(made[number], lambda file, stored=stored: file.write(stored))  # type: ignore[misc]
+            write_whole(made[number], values.tobytes())
 
 
 def _channels(files: list[Path], pixels: list[int]) -> int:

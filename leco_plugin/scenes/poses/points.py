@@ -238,6 +238,6 @@ def _name_points(path: Path, file: str) -> None:
     """Has a description of a scene name the points; it stays as it was under another name."""
     before, kept = path.read_bytes(), _beside(path, BEFORE)
     if not kept.exists():
-        write_whole(kept, lambda file: file.write(before))
+        write_whole(kept, before)
     meta = json.loads(before.decode("utf-8-sig")) | {"ply_file_path": file}
     write_json(path, meta, indent=1, allow_nan=True)
