@@ -231,7 +231,9 @@ def grid_buffers(
             "the scene is unbounded, and a grid of one level ends at its innermost box: give two "
             "levels or more, or none to have them counted"
         )
-    nested = OccupancyGridEstimator(innermost_box(occupancy), 1, levels)  # for its boxes alone
+    inner = whole_box(occupancy)
+    corners = torch.cat([inner.low, inner.high])
+    nested = OccupancyGridEstimator(corners, 1, levels)  # for its boxes alone
     largest, done = torch.empty(levels * resolution, resolution, resolution), 0
     for box in nested.aabbs:
         for values in _largest_in_cells(occupancy, box, resolution):
@@ -244,16 +246,6 @@ def grid_buffers(
         "occs": largest.view(-1),
         "binaries": (largest >= occupancy.threshold).view(levels, *[resolution] * 3),
     }
-
-
-def innermost_box(occupancy: Occupancy) -> Tensor:
-    """Corners [6] of the box of a bounded scene, or of the uncontracted cube of another one."""
-    center, half = occupancy.space.center.cpu(), occupancy.space.half_extent.cpu()
-    low, high = center - half, center + half
-    if occupancy.space.kind == "box":
-        walls = occupancy.walls.cpu()
-        low, high = torch.maximum(low, walls[:3]), torch.minimum(high, walls[3:])
-    return torch.cat([low, high])
 
 
 def reaching_levels(occupancy: Occupancy) -> int:

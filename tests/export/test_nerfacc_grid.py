@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from ball_occupancy import CENTRE, RADIUS, ball
+from ball_occupancy import CENTRE, ball
 
-from leco_plugin.export import export, grid_buffers, innermost_box, reaching_levels
+from leco_plugin.export import export, grid_buffers, reaching_levels
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.boxes import lookup
 from leco_plugin.samplers.grid import OccupancyGridEstimator
@@ -23,7 +23,8 @@ def unbounded(**report: object) -> Occupancy:
 def walled() -> Occupancy:
     known = ball()
     walls = torch.tensor([-1e6, -1e6, 0.0, 1e6, 1e6, 2.0])
-    return Occupancy(known.gate, known.space, known.threshold, walls=walls)
+    report = {"aabb": walls.tolist()}
+    return Occupancy(known.gate, known.space, known.threshold, report=report, walls=walls)
 
 
 def test_nerfacc_loads_it_and_sees_the_same_cells(tmp_path: Path) -> None:
@@ -33,7 +34,7 @@ def test_nerfacc_loads_it_and_sees_the_same_cells(tmp_path: Path) -> None:
     loaded = torch.load(tmp_path / "grid.pt", weights_only=True)
     theirs = nerfacc.OccGridEstimator([0.0] * 3 + [1.0] * 3, resolution=16, levels=1)
     theirs.load_state_dict(loaded)
-    assert theirs.aabbs[0].tolist() == innermost_box(walled()).tolist()
+    assert theirs.aabbs[0].tolist() == [-1.0, 0.0, 0.0, 3.0, 4.0, 2.0]
     ours = OccupancyGridEstimator([0.0] * 3 + [1.0] * 3, 16)
     ours.load_state_dict(loaded)
     positions = torch.tensor(CENTRE) + 1.5 * torch.randn(2000, 3)
@@ -109,9 +110,3 @@ def test_sizes_out_of_range_are_refused(resolution: int, levels: int) -> None:
 
 def test_a_grid_may_have_one_cell() -> None:
     assert bool(grid_buffers(ball(), 1, 1)["binaries"].all())
-
-
-def test_the_box_of_a_bounded_scene_ends_at_its_walls() -> None:
-    box = innermost_box(walled())
-    assert box[2] == 0.0 and box[5] == 2.0
-    assert float(box[3] - box[0]) == pytest.approx(4.0) and RADIUS < 2.0
