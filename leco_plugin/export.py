@@ -39,7 +39,6 @@ from leco_plugin.export_surface import (
     finest,
     in_comments,
     kept_surface,
-    photograph_colours,
     require_few,
     require_not_its_own,
     require_start,
@@ -51,7 +50,7 @@ from leco_plugin.export_surface import (
 from leco_plugin.log import bar
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.grid import OccupancyGridEstimator
-from leco_plugin.scenes.coloured_points import georeference
+from leco_plugin.scenes.coloured_points import coloured_points, colours_near, georeference
 from leco_plugin.scenes.frames import moved
 from leco_plugin.scenes.whole_files import check_apart, check_place, write_whole
 
@@ -158,7 +157,8 @@ def _export_points(
     colours = None
     earth: dict[str, Any] = {}
     if back is not None and description is not None:
-        colours = photograph_colours(description, surface.positions.numpy())
+        if (known := coloured_points(description)) is not None:
+            colours = colours_near(known, surface.positions.numpy())
         earth = georeference(description)
     write_ply(surface, out, colours, in_comments(earth))
     return {

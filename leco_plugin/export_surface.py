@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from leco_plugin.evaluation.inspection import (
@@ -219,15 +218,6 @@ PATHS = ("file_path", "mask_path", "depth_file_path")
 def in_comments(earth: dict[str, Any]) -> list[str]:
     """Lines for the head of a PLY file, of a `georeference`."""
     return [f"{name} {json.dumps(value)}" for name, value in earth.items()]
-
-
-def photograph_colours(
-    description: Path, positions: NDArray[np.float64]
-) -> NDArray[np.uint8] | None:
-    """Colours [N, 3] of the sparse points nearest to positions [N, 3] in the data's coordinates;
-    None where the scene has no coloured points."""
-    known = coloured_points(description)
-    return None if known is None else colours_near(known, positions)
 
 
 def write_splat_init(
