@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 from ball_occupancy import CENTRE, RADIUS, ball
-from scene_files import refused
+from scene_files import change, described, refused
 from scipy.spatial.transform import Rotation
 
 from leco_plugin.chart.theme import new_figure, save_picture
@@ -129,7 +129,7 @@ def test_a_start_for_splats_is_a_copy_of_the_scene_with_kept_points(
 ) -> None:
     out = scene / "splats.json"
     facts = export(file, "splat-init", out, 32, data=scene)
-    made, known = json.loads(out.read_text()), json.loads((scene / "transforms.json").read_text())
+    made, known = json.loads(out.read_text()), described(scene)
     assert made == known | {"ply_file_path": "splats.ply"}
     points = np.asarray(trimesh.load(scene / "splats.ply").vertices)
     assert facts["points"] == len(points) > facts["sparse_points"] > 400
@@ -253,10 +253,10 @@ def test_another_scene_gives_no_colours_and_no_start_for_splats(
 ) -> None:
     run_config(file, scene)
     assert export(file, "ply", tmp_path / "k.ply", 16)["photograph_colours"]
-    meta = json.loads((scene / "transforms.json").read_text())
-    for frame in meta["frames"]:
+    frames = described(scene)["frames"]
+    for frame in frames:
         frame["transform_matrix"][0][3] += 7.0
-    (scene / "transforms.json").write_text(json.dumps(meta))
+    change(scene, lambda meta: meta.update(frames=frames))
     for format, out in (("ply", "k.ply"), ("splat-init", "s.json")):
         with pytest.raises(ValueError, match="0 of the 3 cameras that the occupancy names are in"):
             export(file, format, tmp_path / out, 16, data=scene)

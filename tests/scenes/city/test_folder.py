@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import shutil
 import signal
 import subprocess
@@ -17,6 +16,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from scene_files import described
 
 from leco_plugin.scenes.city.city import City, CityConfig
 from leco_plugin.scenes.city.folder import CaptureConfig, LayoutName, count_pictures, write_city
@@ -47,7 +47,7 @@ def mega_nerf(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_city_is_rebuilt_from_its_folder(folder: Path) -> None:
     assert City.from_folder(folder).config == CITY
-    transforms = json.loads((folder / "transforms.json").read_text())
+    transforms = described(folder)
     frame = transforms["frames"][5]
     picture = np.array(Image.open(folder / frame["file_path"]))
     pose = np.array(frame["transform_matrix"])[:3]
@@ -58,7 +58,7 @@ def test_the_city_is_rebuilt_from_its_folder(folder: Path) -> None:
 
 
 def test_splits_share_the_pictures_without_overlap(folder: Path) -> None:
-    transforms = json.loads((folder / "transforms.json").read_text())
+    transforms = described(folder)
     paths = {frame["file_path"] for frame in transforms["frames"]}
     train, test = set(transforms["train_filenames"]), set(transforms["test_filenames"])
     assert train | test == paths

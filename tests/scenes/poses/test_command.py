@@ -21,7 +21,7 @@ from rendered_survey import (
     grid,
     write_survey,
 )
-from scene_files import read_ply
+from scene_files import described, read_ply
 
 from leco_plugin import cli
 from leco_plugin.scenes.input_error import InputError
@@ -34,16 +34,11 @@ from leco_plugin.scenes.whole_files import alone_in
 pytestmark = pytest.mark.xdist_group("poses")
 
 
-def meta_of(scene: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((scene / "transforms.json").read_text())
-    return found
-
-
 def places_of(scene: Path) -> dict[str, np.ndarray]:
     """Where each photograph was taken, by its name without an ending."""
     return {
         Path(frame["file_path"]).stem: np.array(frame["transform_matrix"])[:3, 3]
-        for frame in meta_of(scene)["frames"]
+        for frame in described(scene)["frames"]
     }
 
 
@@ -51,7 +46,7 @@ def places_of(scene: Path) -> dict[str, np.ndarray]:
 def test_photographs_of_all_kinds_are_placed_where_they_were_taken(made: Path) -> None:
     found = places_of(made)
     assert len(found) == 12
-    origin = meta_of(made)["geographic_origin"]
+    origin = described(made)["geographic_origin"]
     north = METRES_A_DEGREE[0] * (origin["latitude"] - ORIGIN[0])
     east = METRES_A_DEGREE[1] * (origin["longitude"] - ORIGIN[1])
     for number, place in enumerate(PLACES):
@@ -66,7 +61,7 @@ def test_photographs_of_all_kinds_are_placed_where_they_were_taken(made: Path) -
 
 @pytest.mark.slow
 def test_pictures_are_upright_and_lenses_are_those_of_their_sizes(made: Path) -> None:
-    lenses = {Path(frame["file_path"]).stem: frame for frame in meta_of(made)["frames"]}
+    lenses = {Path(frame["file_path"]).stem: frame for frame in described(made)["frames"]}
     for name, lens in lenses.items():
         size = (WIDTH - 40, HEIGHT - 40) if name == "IMG_0007" else (WIDTH, HEIGHT)
         with Image.open(made / lens["file_path"]) as image:
@@ -76,7 +71,7 @@ def test_pictures_are_upright_and_lenses_are_those_of_their_sizes(made: Path) ->
 
 @pytest.mark.slow
 def test_the_scene_is_upright_in_metres_with_points_in_its_coordinates(made: Path) -> None:
-    meta = meta_of(made)
+    meta = described(made)
     assert meta["metres_per_unit"] == 1.0
     assert meta["geographic_origin"]["latitude"] == pytest.approx(41.5, abs=1e-3)
     points = read_ply(made / meta["ply_file_path"])
@@ -193,7 +188,7 @@ def test_a_survey_whose_gps_is_mended_is_placed_anew_from_its_matches(
     report = make_scene(folder, out, threads=1)
     assert "EXIF has other GPS than before" in capsys.readouterr().out
     assert report["gps"]["used"] and report["gps"]["most_metres"] < 1.0
-    assert meta_of(out)["metres_per_unit"] == 1.0
+    assert described(out)["metres_per_unit"] == 1.0
     assert "metres_per_unit" not in json.loads((out / "transforms.before_gps.json").read_text())
     assert make_scene(folder, out, threads=1) == report
     assert "nothing is done" in capsys.readouterr().out
@@ -232,7 +227,7 @@ def test_of_two_blocks_the_largest_is_written_and_wrong_gps_is_not_used(
     kept = [pycolmap.Reconstruction(each) for each in (out / "colmap/models").glob("[0-9]*")]
     assert sorted(each.num_reg_images() for each in kept) == [4, 6]
     assert "no metres: GPS contradicts the poses: " in said and "mend EXIF" in said
-    meta = meta_of(out)
+    meta = described(out)
     assert not {"metres_per_unit", "geographic_origin"} & {*meta}
     assert min(frame["transform_matrix"][2][2] for frame in meta["frames"]) > 0.9
 

@@ -14,7 +14,7 @@ import torch
 from nerfstudio.cameras.cameras import CameraType
 from PIL import Image
 from rendered_survey import BLOCKS
-from scene_files import read_ply
+from scene_files import change, described, read_ply
 
 from leco_plugin import cli
 from leco_plugin.scenes.input_error import InputError
@@ -34,31 +34,31 @@ def bare(made: Path, tmp_path: Path) -> Path:
     """The scene that `leco poses` made, far from its origin and without its points."""
     scene = tmp_path / "bare"
     shutil.copytree(made / "images", scene / "images")
-    meta = json.loads((made / "transforms.json").read_text())
-    del meta["ply_file_path"]
-    for frame in meta["frames"]:
-        for row, shift in zip(frame["transform_matrix"], FAR_AWAY):
-            row[3] += float(shift)
-    (scene / "transforms.json").write_text(json.dumps(meta))
+    shutil.copy(made / "transforms.json", scene)
+
+    def move(meta: dict[str, Any]) -> None:
+        del meta["ply_file_path"]
+        for frame in meta["frames"]:
+            for row, shift in zip(frame["transform_matrix"], FAR_AWAY):
+                row[3] += float(shift)
+
+    change(scene, move)
     return scene
 
 
 @pytest.fixture
 def few(bare: Path) -> Path:
     """Eight photographs of that scene: two rows of the flight."""
-    meta = json.loads((bare / "transforms.json").read_text())
-    meta["frames"] = sorted(meta["frames"], key=lambda frame: frame["file_path"])[:8]
-    (bare / "transforms.json").write_text(json.dumps(meta))
+    frames = sorted(described(bare)["frames"], key=lambda frame: frame["file_path"])
+    change(bare, lambda meta: meta.update(frames=frames[:8]))
     return bare
 
 
-def shuffle_poses(scene: Path) -> None:
+def shuffle(meta: dict[str, Any]) -> None:
     """Gives each photograph the pose of another one."""
-    meta = json.loads((scene / "transforms.json").read_text())
     poses = [frame["transform_matrix"] for frame in meta["frames"]]
     for frame, other in zip(meta["frames"], np.random.default_rng(0).permutation(len(poses))):
         frame["transform_matrix"] = poses[other]
-    (scene / "transforms.json").write_text(json.dumps(meta))
 
 
 def test_points_lie_where_mapping_finds_them_and_nothing_else_changes(
@@ -75,7 +75,7 @@ def test_points_lie_where_mapping_finds_them_and_nothing_else_changes(
     assert off.median() < 0.1 and off.quantile(0.9) < 0.5
     assert torch.cdist(known, found).amin(dim=1).median() < 0.1
     assert (bare / BEFORE).read_bytes() == before
-    meta = json.loads((bare / "transforms.json").read_text())
+    meta = described(bare)
     assert meta.pop("ply_file_path") == FILE and meta == json.loads(before)
     assert cli.main(["points", str(bare)]) == 0
     assert "has" in (said := capsys.readouterr().out) and "nothing is done" in said
@@ -84,7 +84,7 @@ def test_points_lie_where_mapping_finds_them_and_nothing_else_changes(
 @pytest.mark.parametrize("hidden_by", ["masks", "opacity"])
 def test_what_is_hidden_gets_no_points(few: Path, hidden_by: str) -> None:
     """The left third of each photograph is hidden; no point is there in all that see it."""
-    bare, meta = few, json.loads((few / "transforms.json").read_text())
+    bare, meta = few, described(few)
     for number, frame in enumerate(meta["frames"]):
         with Image.open(bare / frame["file_path"]) as image:
             shown = Image.new("L", image.size, 255)
@@ -116,12 +116,11 @@ def test_what_is_hidden_gets_no_points(few: Path, hidden_by: str) -> None:
 
 
 def test_poses_of_other_photographs_are_refused_and_nothing_is_written(few: Path) -> None:
-    bare = few
-    shuffle_poses(bare)
-    before = sorted(bare.iterdir()), (bare / "transforms.json").read_bytes()
+    change(few, shuffle)
+    before = sorted(few.iterdir()), (few / "transforms.json").read_bytes()
     with pytest.raises(InputError, match=r"agree with the poses in .*`leco poses` makes both"):
-        find_points(bare, threads=1)
-    assert (sorted(bare.iterdir()), (bare / "transforms.json").read_bytes()) == before
+        find_points(few, threads=1)
+    assert (sorted(few.iterdir()), (few / "transforms.json").read_bytes()) == before
 
 
 def test_photographs_that_share_too_little_are_refused(pycolmap: Any, tiny_scene: Path) -> None:
