@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import pytest
@@ -61,6 +62,15 @@ def test_on_a_terminal_it_is_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
     with log.bar("Guided") as show:
         show(0.5)
     assert "Guided" in terminal.getvalue() and "\x1b[" in terminal.getvalue()
+
+
+def test_what_is_made_of_each_thing_comes_back_and_each_moves_the_bar(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    shares: list[float] = []
+    monkeypatch.setattr(log, "bar", lambda what: nullcontext(shares.append))
+    assert log.for_each("Squaring", [1, 2, 3, 4], lambda n: n * n) == [1, 4, 9, 16]
+    assert shares == [0.25, 0.5, 0.75, 1.0]
 
 
 @pytest.mark.parametrize("first", [True, False])

@@ -24,7 +24,7 @@ from PIL import Image
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from leco_plugin.log import bar, counted, resumable
+from leco_plugin.log import counted, for_each, resumable
 from leco_plugin.scenes.input_error import InputError, one_line, require_folder
 from leco_plugin.scenes.whole_files import alone_in, remove_parts, write_json, write_whole
 
@@ -64,19 +64,19 @@ def make_scene(records: Path, out: Path) -> dict[str, Any]:
     files = sorted(path for path in records.rglob("*.tfrecord*") if path.is_file())
     if all("validation" in path.name for path in files):
         raise InputError(f"{records} has no records to train on, *train.tfrecord*")
-    with alone_in(out, "scene"), resumable(), bar("Reading the records") as show:
+    with alone_in(out, "scene"), resumable():
         if (out / SCENE).exists():
             raise InputError(f"--out {out} holds a scene already: give another folder")
         remove_parts(out)
-        found = []
-        for number, path in enumerate(files):
+
+        def rays_of(path: Path) -> NDArray[Any]:
             kept = out / READ / f"{_digest(path)}.npy"
-            if kept.is_file():
-                found.append(np.load(kept))
-            else:
-                found.append(np.array([*_read(path, out)], dtype=RAYS))
-                write_whole(kept, lambda file, rays=found[-1]: np.save(file, rays))  # type: ignore[misc]
-            show((number + 1) / len(files))
+            if not kept.is_file():
+                rays = np.array([*_read(path, out)], dtype=RAYS)
+                write_whole(kept, lambda file: np.save(file, rays))
+            return np.asarray(np.load(kept))
+
+        found = for_each("Reading the records", files, rays_of)
         pictures = np.sort(np.concatenate(found), order=("name", "test"))
         names = pictures["name"]
         report = _write_scene(out, pictures[np.append(names[1:] != names[:-1], True)])

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from leco_plugin.log import bar, resumable
+from leco_plugin.log import resumable
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.poses import ASKED
 from leco_plugin.scenes.poses import georeference as world
@@ -65,8 +65,7 @@ def make_scene(
     with alone_in(out, "scene"), resumable():
         _begin(out, asked)
         _require_disk(out, found.photographs)
-        with bar("copying photographs") as show:
-            found = copy_photographs(found, out / "images", show)
+        found = copy_photographs(found, out / "images")
         for line in list(found.refused.values())[:NAMED]:
             print(f"left out: {line}")
         if (out / DESCRIPTION).exists():  # it was finished, and has lost files since

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from PIL import ExifTags, Image
 
-from leco_plugin.log import by_number, counted
+from leco_plugin.log import by_number, counted, for_each
 from leco_plugin.scenes.input_error import InputError, require_folder
 from leco_plugin.scenes.photograph_files import Header, check_kind, decode, header_of, is_plain
 from leco_plugin.scenes.whole_files import write_whole, writing_into
@@ -296,20 +296,19 @@ def _read(path: Path, folder: Path) -> Photograph:
     return replace(photograph, name=name if name.endswith(ending) else name + ending)
 
 
-def copy_photographs(found: Found, folder: Path, show: Callable[[float], None]) -> Found:
-    """Writes the copies that are missing; `show` takes the share that is done. Returns what was
-    found without what cannot be decoded. InputError if fewer than three photographs are left, or a
-    copy cannot be written."""
-    photographs, refused = [], dict(found.refused)
-    for number, photograph in enumerate(found.photographs):
-        copy = folder / photograph.name
+def copy_photographs(found: Found, folder: Path) -> Found:
+    """Writes the copies that are missing. Returns what was found without what cannot be decoded.
+    InputError if fewer than three photographs are left, or a copy cannot be written."""
+    refused = dict(found.refused)
+
+    def copy(photograph: Photograph) -> None:
+        path = folder / photograph.name
         # plain copies are decoded too: it shows which are cut off
-        if not copy.is_file() and (image := _or_why(decode, photograph.path, True, refused)):
-            _write(photograph, image, copy)
-        if photograph.path not in refused:
-            photographs.append(photograph)
-        show((number + 1) / len(found.photographs))
-    return _enough(Found(photographs, refused))
+        if not path.is_file() and (image := _or_why(decode, photograph.path, True, refused)):
+            _write(photograph, image, path)
+
+    for_each("copying photographs", found.photographs, copy)
+    return _enough(Found([each for each in found.photographs if each.path not in refused], refused))
 
 
 def _write(photograph: Photograph, image: Image.Image, path: Path) -> None:

@@ -14,7 +14,7 @@ from nerfstudio.cameras.cameras import CameraType
 from numpy.typing import NDArray
 from PIL import Image
 
-from leco_plugin.log import bar, counted
+from leco_plugin.log import bar, counted, for_each
 from leco_plugin.scenes.bounds import FEWEST_POINTS
 from leco_plugin.scenes.coloured_points import read_points
 from leco_plugin.scenes.input_error import InputError
@@ -76,9 +76,10 @@ def find_points(data: Path, size: int = 1600, threads: int = 0) -> dict[str, Any
     with tempfile.TemporaryDirectory() as work:
         pictures = scene.pictures()
         sides = [min(size, max(header_of(pictures[number]).size)) for number in chosen]
-        copies = sum(BYTES_A_SQUARE * side**2 for side in sides)
-        require_disk(Path(work), len(chosen), copies, "TMPDIR")
-        photographs, cameras = _copies(scene, chosen, Path(work) / "images", size)
+        needed = sum(BYTES_A_SQUARE * side**2 for side in sides)
+        require_disk(Path(work), len(chosen), needed, "TMPDIR")
+        copies = _copies(scene, chosen, Path(work) / "images", size)
+        photographs, cameras = zip(*copies)
         reconstructor = Reconstructor(Path(work), photographs, threads)
         reconstructor.folder.mkdir()
         reconstructor.extract("perspective", size)
@@ -159,32 +160,29 @@ def _refuse_few(model: Any, matched: int, path: Path) -> None:
 
 def _copies(
     scene: SceneFile, chosen: Sequence[int], folder: Path, size: int
-) -> tuple[list[Photograph], list[Any]]:
+) -> list[tuple[Photograph, Any]]:
     """Photographs as their lenses mean them, in a folder, with a longest side of `size` pixels; and
     their cameras. What masks and opacity hide goes to the folder MASKS beside."""
-    masks = folder.with_name(MASKS)
+    masks, pictures = folder.with_name(MASKS), scene.pictures()
     folder.mkdir()
-    photographs, cameras, pictures = [], [], scene.pictures()
-    with bar("reading photographs") as show:
-        for count, number in enumerate(chosen):
-            path, lens = pictures[number], scene.lenses[number]
-            header = header_of(path)
-            full = (int(lens.width or header.size[0]), int(lens.height or header.size[1]))
-            with decode(path, is_turned(header, full)) as image:
-                copy, seen = image.convert("RGB"), _seen(scene, number, path, image)
-            copy.thumbnail((size, size), Image.Resampling.LANCZOS)
-            file = folder / f"{number:06d}.png"
-            copy.save(file, compress_level=1)
-            if seen is not None:
-                masks.mkdir(exist_ok=True)
-                seen.resize(copy.size, Image.Resampling.NEAREST).save(masks / f"{file.name}.png")
-            camera = camera_of(lens, full, copy.size, str(path))
-            lens_name = str(sorted(camera.todict().items(), key=str))  # shared by equal ones
-            exif = Exif(camera=lens_name)
-            photographs.append(Photograph(file, file.name, header_of(file), exif))
-            cameras.append(camera)
-            show((count + 1) / len(chosen))
-    return photographs, cameras
+
+    def copied(number: int) -> tuple[Photograph, Any]:
+        path, lens = pictures[number], scene.lenses[number]
+        header = header_of(path)
+        full = (int(lens.width or header.size[0]), int(lens.height or header.size[1]))
+        with decode(path, is_turned(header, full)) as image:
+            copy, seen = image.convert("RGB"), _seen(scene, number, path, image)
+        copy.thumbnail((size, size), Image.Resampling.LANCZOS)
+        file = folder / f"{number:06d}.png"
+        copy.save(file, compress_level=1)
+        if seen is not None:
+            masks.mkdir(exist_ok=True)
+            seen.resize(copy.size, Image.Resampling.NEAREST).save(masks / f"{file.name}.png")
+        camera = camera_of(lens, full, copy.size, str(path))
+        lens_name = str(sorted(camera.todict().items(), key=str))  # shared by equal ones
+        return Photograph(file, file.name, header_of(file), Exif(camera=lens_name)), camera
+
+    return for_each("reading photographs", chosen, copied)
 
 
 def _seen(scene: SceneFile, number: int, path: Path, image: Image.Image) -> Image.Image | None:

@@ -28,7 +28,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def copies(folder: Path, out: Path) -> dict[str, Image.Image]:
-    copy_photographs(find_photographs(folder, out), out / "images", lambda share: None)
+    copy_photographs(find_photographs(folder, out), out / "images")
     opened = {}
     for path in (out / "images").iterdir():
         with Image.open(path) as image:
@@ -216,10 +216,9 @@ def test_a_photograph_of_many_that_cannot_be_used_is_left_out(folder: Path, tmp_
     Image.fromarray(np.zeros((24, 32), dtype=np.uint16)).save(folder / "deep.png")
     found = find_photographs(folder, tmp_path / "out")
     assert len(found.photographs) == 4  # what is cut off shows when it is decoded
-    shares: list[float] = []
-    left = copy_photographs(found, tmp_path / "out" / "images", shares.append)
+    left = copy_photographs(found, tmp_path / "out" / "images")
     names = [each.name for each in left.photographs]
-    assert names == ["IMG_0.jpg", "IMG_1.jpg", "IMG_2.jpg"] and shares[-1] == 1.0
+    assert names == ["IMG_0.jpg", "IMG_1.jpg", "IMG_2.jpg"]
     assert sorted(path.name for path in (tmp_path / "out" / "images").iterdir()) == names
     reasons = {path.name: line for path, line in left.refused.items()}
     assert reasons.keys() == {"cut.jpg", "none.jpg", "deep.png"}
@@ -365,7 +364,7 @@ def test_a_picture_larger_than_pillow_opens_is_named_with_its_reason(
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found = find_photographs(folder, tmp_path / "out")
-        copied = copy_photographs(found, tmp_path / "out" / "images", lambda share: None)
+        copied = copy_photographs(found, tmp_path / "out" / "images")
     assert len(copied.photographs) == 3
     Image.new("RGB", (64, 25)).save(folder / "IMG_7.jpg")
     (why,) = find_photographs(folder, tmp_path / "out").refused.values()
