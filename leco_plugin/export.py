@@ -35,7 +35,6 @@ from leco_plugin.evaluation.occupancy_picture import draw
 from leco_plugin.export_surface import (
     CELLS,
     KeptSurface,
-    Progress,
     finest,
     in_comments,
     kept_surface,
@@ -86,7 +85,7 @@ def export(
             run. None is `data` where the file says how. Grid and volume are in those of the run, a
             start for splats in those of the data.
         data: the scene that it was learned on; None is that of the run in whose folder `file` lies.
-        surface: what `surface_of` finds at this resolution, where it is known already.
+        surface: what `kept_surface` finds at this resolution, where it is known already.
     Returns:
         What was written, as JSON values.
     Raises:
@@ -108,15 +107,14 @@ def export(
     if format == "nerfacc-grid":
         facts = _export_grid(occupancy, out, resolution, levels)
     elif format == "npz":
-        with bar(f"Asking the gate about cells of 1/{resolution}") as show:
-            facts = write_volume(occupancy, resolution, back, out, show)
+        facts = write_volume(occupancy, resolution, back, out)
     else:
         description = scene_of(occupancy, file, data)
         if format == "splat-init":
             require_start(out, description)
         elif description is not None:
             require_not_its_own(out, description)
-        surface = surface or surface_of(occupancy, resolution)
+        surface = surface or kept_surface(occupancy, resolution)
         facts = _export_points(occupancy, surface, format, out, back, description)
     known = {"format": 1, "written": format, "resolution": resolution}
     return {**known, **facts, "bytes": out.stat().st_size}
@@ -176,18 +174,11 @@ def default_resolution(occupancy: Occupancy, format: Format) -> int:
     return finest(whole_box(occupancy) if format == "npz" else mapped_box(occupancy))
 
 
-def surface_of(occupancy: Occupancy, resolution: int) -> KeptSurface:
-    """`kept_surface` with a progress bar."""
-    with bar(f"Asking the gate about cells of 1/{resolution}") as show:
-        return kept_surface(occupancy, resolution, show)
-
-
 def _export_grid(
     occupancy: Occupancy, out: Path, resolution: int, levels: int | None
 ) -> dict[str, Any]:
     """Writes an occupancy grid of nerfacc, which `torch.load(..., weights_only=True)` reads."""
-    with bar(f"Asking the gate about {resolution}^3 cells a level") as show:
-        buffers = grid_buffers(occupancy, resolution, levels, show)
+    buffers = grid_buffers(occupancy, resolution, levels)
     write_whole(out, lambda file: torch.save(buffers, file))
     return {
         "frame": "run",
@@ -198,10 +189,7 @@ def _export_grid(
 
 
 def grid_buffers(
-    occupancy: Occupancy,
-    resolution: int = 128,
-    levels: int | None = None,
-    on_progress: Progress = lambda share: None,
+    occupancy: Occupancy, resolution: int = 128, levels: int | None = None
 ) -> dict[str, Tensor]:
     """What `OccGridEstimator(aabb, resolution, levels).load_state_dict` takes.
 
@@ -235,11 +223,12 @@ def grid_buffers(
     corners = torch.cat([inner.low, inner.high])
     nested = OccupancyGridEstimator(corners, 1, levels)  # for its boxes alone
     largest, done = torch.empty(levels * resolution, resolution, resolution), 0
-    for box in nested.aabbs:
-        for values in _largest_in_cells(occupancy, box, resolution):
-            largest[done : done + len(values)] = values
-            done += len(values)
-            on_progress(done / len(largest))
+    with bar(f"Asking the gate about {resolution}^3 cells a level") as show:
+        for box in nested.aabbs:
+            for values in _largest_in_cells(occupancy, box, resolution):
+                largest[done : done + len(values)] = values
+                done += len(values)
+                show(done / len(largest))
     return {
         "resolution": torch.full_like(nested.resolution, resolution),
         "aabbs": nested.aabbs,
@@ -303,7 +292,7 @@ def export_folder(
     folder.mkdir(parents=True, exist_ok=True)
 
     cells = default_resolution(occupancy, "ply") if resolution is None else resolution
-    surface = functools.cache(lambda: surface_of(occupancy, cells))
+    surface = functools.cache(lambda: kept_surface(occupancy, cells))
 
     def exported(name: str, format: Format, use: Callable[[Facts], str]) -> Part:
         def write() -> Facts:

@@ -7,11 +7,12 @@ air around every surface.
 
 from __future__ import annotations
 
+import functools
 import io
 import json
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,6 +29,7 @@ from leco_plugin.evaluation.inspection import (
     seen_at,
     whole_box,
 )
+from leco_plugin.log import for_each
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.coloured_points import (
     GREY,
@@ -59,9 +61,6 @@ REACH = 1 / 16
 COLOURS = "magma"
 """Of matplotlib, for o(x) in [0, 1]: as in the picture of `leco inspect`."""
 
-Progress = Callable[[float], None]
-"""Called with the share that is done."""
-
 
 class KeptSurface(NamedTuple):
     """Middles of kept cells on the surface."""
@@ -72,9 +71,7 @@ class KeptSurface(NamedTuple):
     """[P] o(x)."""
 
 
-def kept_surface(
-    occupancy: Occupancy, resolution: int, on_progress: Progress = lambda share: None
-) -> KeptSurface:
+def kept_surface(occupancy: Occupancy, resolution: int) -> KeptSurface:
     """Kept cells at which rays from the nearest camera first meet matter.
 
     Where the file names no cameras, all kept cells that touch a skipped one.
@@ -89,14 +86,16 @@ def kept_surface(
     box = mapped_box(occupancy)
     counts = _few_cells(box, resolution, "a surface")
     axes = [box.axis(number, count) for number, count in enumerate(counts)]
-    cells, parts = math.prod(counts), []
-    for first in range(0, cells, CELLS_AT_ONCE):
+    cells = math.prod(counts)
+
+    def ask(first: int) -> Tensor:
         numbers = torch.arange(first, min(first + CELLS_AT_ONCE, cells))
         indices = torch.unravel_index(numbers, counts)
         places = torch.stack([axis[index] for axis, index in zip(axes, indices)], dim=-1)
-        parts.append(query(occupancy, _unmap(occupancy, places)))
-        on_progress(0.3 * (first + len(numbers)) / cells)
-    values = torch.cat(parts).view(*counts)
+        return query(occupancy, _unmap(occupancy, places))
+
+    what = f"Asking the gate about cells of 1/{resolution}"
+    values = torch.cat(for_each(what, range(0, cells, CELLS_AT_ONCE), ask)).view(*counts)
     kept, cameras = values >= occupancy.threshold, cameras_of(occupancy)
     if not bool(kept.any()):
         raise ValueError(
@@ -108,17 +107,15 @@ def kept_surface(
         return KeptSurface(_unmap(occupancy, _at(axes, shell)), values[shell])
     matter = kept & (values >= MATTER * values.max())
     cell = float((box.high - box.low).max()) / resolution
-    places, met = _at(axes, matter), []
-    for number, part in enumerate(places.split(CELLS_AT_ONCE >> 4)):
-        met.append(_first_met(occupancy, part, cameras, cell, round(REACH * resolution)))
-        on_progress(0.3 + 0.7 * min(1.0, (number + 1) * (CELLS_AT_ONCE >> 4) / len(places)))
-    places = places[torch.cat(met)]
-    if not len(places):
+    places = _at(axes, matter)
+    meets = functools.partial(_first_met, occupancy, cameras, cell, round(REACH * resolution))
+    met = torch.cat(for_each("Looking along rays", places.split(CELLS_AT_ONCE >> 4), meets))
+    if not bool(met.any()):
         raise ValueError(
             "no camera sees a surface of what is kept: all of them lie inside it; look at it with "
             "leco inspect"
         )
-    return KeptSurface(_unmap(occupancy, places), values[matter][torch.cat(met)])
+    return KeptSurface(_unmap(occupancy, places[met]), values[matter][met])
 
 
 def _at(axes: Sequence[Tensor], chosen: Tensor) -> Tensor:
@@ -128,7 +125,7 @@ def _at(axes: Sequence[Tensor], chosen: Tensor) -> Tensor:
 
 
 def _first_met(
-    occupancy: Occupancy, places: Tensor, cameras: Tensor, cell: float, steps: int
+    occupancy: Occupancy, cameras: Tensor, cell: float, steps: int, places: Tensor
 ) -> Tensor:
     """Whether rays from the nearest camera [C, 3] (scene units) meet matter at mapped places
     [K, 3], and not before: bool [K]. So many `steps` of a cell's mapped size before and behind a
@@ -283,11 +280,7 @@ def _from_elsewhere(meta: dict[str, Any], scene: Path, folder: Path) -> dict[str
 
 
 def write_volume(
-    occupancy: Occupancy,
-    resolution: int,
-    back: Tensor | None,
-    out: Path,
-    on_progress: Progress,
+    occupancy: Occupancy, resolution: int, back: Tensor | None, out: Path
 ) -> dict[str, Any]:
     """Writes o(x) at the middles of cells of the box as a NumPy file.
 
@@ -300,18 +293,18 @@ def write_volume(
     counts = _few_cells(box, resolution, "a volume")
     x, y, z = (box.axis(number, count) for number, count in enumerate(counts))
     layers = max(1, CELLS_AT_ONCE // (counts[1] * counts[2]))
-    values, seen = [], []
-    for part in x.split(layers):
+
+    def ask(part: Tensor) -> tuple[Tensor, Tensor]:
         positions = torch.stack(torch.meshgrid(part, y, z, indexing="ij"), dim=-1)
-        values.append(query(occupancy, positions))
-        seen.append(seen_at(occupancy, positions))
-        on_progress(sum(map(len, values)) / counts[0])
-    o = torch.cat(values)
+        return query(occupancy, positions), seen_at(occupancy, positions)
+
+    what = f"Asking the gate about cells of 1/{resolution}"
+    o, seen = map(torch.cat, zip(*for_each(what, x.split(layers), ask)))
     kept = o >= occupancy.threshold
     arrays: dict[str, Any] = {
         "o": o.half().numpy(),
         "kept": kept.numpy(),
-        "seen": torch.cat(seen).numpy(),
+        "seen": seen.numpy(),
         "low": box.low.numpy(),
         "high": box.high.numpy(),
         "threshold": np.float32(occupancy.threshold),

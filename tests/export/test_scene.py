@@ -155,7 +155,7 @@ def test_what_does_not_go_together_is_refused_in_one_line_before_the_gate_is_ask
     file: Path, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     own = scene / "transforms.json"
-    monkeypatch.setattr("leco_plugin.export.surface_of", lambda *_: pytest.fail("asked"))
+    monkeypatch.setattr("leco_plugin.export.kept_surface", lambda *_: pytest.fail("asked"))
     for options, said in (
         (("splat-init", own, 24, None, None, scene), "the scene's own transforms.json"),
         (("ply", scene / "points.ply", 24, None, None, scene), "the scene's own points"),
@@ -183,11 +183,12 @@ def test_a_folder_has_everything_and_says_what_each_part_is_for(
         asked.append(said)
         return nullcontext(lambda share: None)
 
-    monkeypatch.setattr("leco_plugin.export.bar", noted)
+    for room in ("export", "log"):
+        monkeypatch.setattr(f"leco_plugin.{room}.bar", noted)
     parts, doubted = export_folder(file, folder, 32, scene)
     # the pictures, the surface once, for points and splats, and the volume
     gate = "Asking the gate about cells of 1/32"
-    assert asked == ["Drawing pictures", gate, gate]
+    assert asked == ["Drawing pictures", gate, "Looking along rays", gate]
     names = ["occupancy.png", "occupancy.html", "kept.ply", "splats.json", "volume.npz"]
     assert [part.name for part in parts if part.facts] == names and not doubted
     assert {path.name for path in folder.iterdir()} == {*names, "splats.ply"}
