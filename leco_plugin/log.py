@@ -18,7 +18,8 @@ from torch import distributed
 
 from leco_plugin.models.compute.ranks import is_first
 
-T, R = TypeVar("T"), TypeVar("R")
+T = TypeVar("T")
+R = TypeVar("R")
 SECONDS_TO_FIRST, SECONDS_A_LINE, SHARE_A_LINE = 10.0, 60.0, 0.05
 """To the first line without a terminal to draw a bar on, and between two lines: seconds, share."""
 OF_A_DEVICE = ("leco_plugin.samplers.kernels.fused", "leco_plugin.models.compute.grouped")

@@ -111,7 +111,8 @@ class NerfstudioLayout(Layout):
                 image = np.asarray(opened)
             most = _SPARSE_POINTS_PER_VIEW
             found.append(self.lens.some_points(view.pose, depth, image, most, random))
-        write_points(folder / POINTS, *map(np.concatenate, zip(*found)))
+        places, colours = map(np.concatenate, zip(*found))
+        write_points(folder / POINTS, places, colours)
         write_json(folder / TRANSFORMS, self._transforms(), indent=1)
 
     def _transforms(self) -> dict[str, Any]:
