@@ -75,7 +75,7 @@ def test_resuming_has_the_same_rays(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     """Also whoever has learned the field, with rays to sparse points, and whatever was drawn
     between."""
     capture = CaptureConfig(24, 18, aerial_per_block=12.0, street_per_block=0.0)
-    city = write_city(CityConfig(1), tmp_path / "city", capture, progress=False)
+    city = write_city(CityConfig(1), tmp_path / "city", capture)
     monkeypatch.setattr(measuring, "RAYS", 128)
     monkeypatch.setattr(measuring, "TAUGHT_RAYS", 256)
     monkeypatch.setattr(measuring, "VOLUME_POINTS", 512)

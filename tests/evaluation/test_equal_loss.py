@@ -206,7 +206,7 @@ def few_points(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory: pytest.TempPathFactory) -> CityTruth:
     folder = tmp_path_factory.mktemp("truth") / "city"
-    write_city(CityConfig(blocks=1), folder, CaptureConfig(48, 36), progress=False)
+    write_city(CityConfig(blocks=1), folder, CaptureConfig(48, 36))
     transform = torch.eye(4)[:3]
     outputs = SimpleNamespace(dataparser_transform=transform, dataparser_scale=SCALE)
     return CityTruth.from_dataparser(folder, outputs)
