@@ -26,6 +26,7 @@ ENCODINGS = {
     "k-planes": EncodingConfig("k-planes", levels=3, coarsest=8, plane_cells=32),
     "grid": EncodingConfig("grid", plane_cells=32),
 }
+WALLS = torch.tensor([-1e6, -1e6, -1.0, 1e6, 1e6, 2.0])
 
 
 @functools.cache
@@ -48,11 +49,11 @@ def ball(kind: str = "frequency") -> Occupancy:
         loss.backward()
         optimizer.step()
     report = {
-        "aabb": [-1e6, -1e6, -1.0, 1e6, 1e6, 2.0],
+        "aabb": WALLS.tolist(),
         "cameras": [[1.0, 0.5, 1.8], [2.5, 2.0, 1.8], [1.0, 3.5, 1.8]],
         "empty_fraction": 0.9,
     }
-    return Occupancy(gate, Space("box", CENTRE, HALF), 0.5, report=report).eval()
+    return Occupancy(gate, Space("box", CENTRE, HALF), 0.5, report=report, walls=WALLS).eval()
 
 
 SCENE_FRAME = torch.eye(3, 4).tolist()

@@ -112,17 +112,14 @@ def doubts(facts: dict[str, Any]) -> list[str]:
 
 
 def whole_box(occupancy: Occupancy) -> ViewBox:
-    """The space's inner cube, cut by the walls between which rays were marched, if any."""
+    """The space's inner cube, cut by the walls in which the gate was taught, if there are any."""
     center = occupancy.space.center.cpu()
     half = float(occupancy.space.half_extent)
-    low, high = center - half, center + half
-    walls = numbers(occupancy.report.get("aabb"))
-    if len(walls) == 6:
-        wall = torch.tensor(walls)
-        cut_low, cut_high = torch.maximum(low, wall[:3]), torch.minimum(high, wall[3:])
-        if bool((cut_low < cut_high).all()):
-            return ViewBox(cut_low, cut_high)
-    return ViewBox(low, high)
+    low, high = occupancy.walls.cpu().view(2, 3)
+    cut_low, cut_high = torch.maximum(center - half, low), torch.minimum(center + half, high)
+    if bool((cut_low < cut_high).all()):
+        return ViewBox(cut_low, cut_high)
+    return ViewBox(center - half, center + half)
 
 
 def mapped_box(occupancy: Occupancy) -> ViewBox:

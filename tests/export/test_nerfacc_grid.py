@@ -24,8 +24,7 @@ def unbounded(**report: object) -> Occupancy:
 def walled() -> Occupancy:
     known = ball()
     walls = torch.tensor([-1e6, -1e6, 0.0, 1e6, 1e6, 2.0])
-    report = {"aabb": walls.tolist()}
-    return Occupancy(known.gate, known.space, known.threshold, report=report, walls=walls)
+    return Occupancy(known.gate, known.space, known.threshold, walls=walls)
 
 
 def test_nerfacc_loads_it_and_sees_the_same_cells(tmp_path: Path) -> None:
