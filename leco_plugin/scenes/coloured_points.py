@@ -240,7 +240,7 @@ def told_by(scene: SceneFile, data: Path, outputs: Any) -> dict[str, Any]:
     meta = scene.meta
     try:
         applied, applied_scale = applied_in(meta, scene.path.parent)
-        frame = from_file(parsed_frame(outputs), applied, applied_scale)
+        frame = from_file(parsed_frame(outputs), applied, applied_scale, torch.float64)
     except (ValueError, TypeError, RuntimeError) as error:
         raise InputError(f"{data} cannot be read: {one_line(error, 120)}") from None
     points = None if POINTS in outputs.metadata else read_points(meta, scene.path.parent)

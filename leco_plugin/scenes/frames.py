@@ -31,12 +31,13 @@ def frame_of(datamanager: Any) -> list[list[float]] | None:
 
 def data_frame_of(datamanager: Any) -> list[list[float]] | None:
     """The same from positions in the data's own files, after any `applied_transform`."""
-    outputs = getattr(datamanager, "train_dataparser_outputs", None)
-    if outputs is None:
+    frame = frame_of(datamanager)
+    if frame is None:
         return None
-    applied, scale = (getattr(outputs, "metadata", None) or {}).get(APPLIED, (None, 1.0))
+    metadata = getattr(datamanager.train_dataparser_outputs, "metadata", None) or {}
+    applied, scale = metadata.get(APPLIED, (None, 1.0))
     try:
-        return from_file(parsed_frame(outputs), applied, scale).tolist()
+        return from_file(frame, applied, scale, torch.float64).tolist()
     except (ValueError, TypeError, RuntimeError):  # it leads nowhere back
         return None
 
@@ -75,18 +76,23 @@ def applied_in(meta: dict[str, Any], folder: Path) -> tuple[Any, float]:
 
 
 def from_file(
-    frame: Tensor, applied_transform: list[list[float]] | None, applied_scale: float = 1.0
+    frame: list[list[float]] | Tensor,
+    applied_transform: list[list[float]] | None,
+    applied_scale: float = 1.0,
+    dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """The frame for positions as a transforms.json has them: [3, 4] float64.
+    """The frame for positions as a transforms.json has them: [3, 4].
 
     What ns-process-data has done to poses and points before it wrote them, a frame does too.
 
     Args:
-        frame: [3, 4] float64 from the scene's coordinates, as of `parsed_frame`.
+        frame: [3, 4] from the scene's coordinates, as of `frame_of`.
         applied_transform, applied_scale: of that file, as of `applied_in`.
+        dtype: of the frame. Coordinates as large as UTM's need float64.
     Raises:
         ValueError: they are not finite, or lead nowhere back.
     """
+    frame = torch.as_tensor(frame, dtype=torch.float64)
     applied = torch.eye(3, 4) if applied_transform is None else applied_transform
     matrix = torch.as_tensor(applied, dtype=torch.float64)
     if matrix.shape not in ((3, 4), (4, 4)) or not bool(matrix.isfinite().all()):
@@ -98,7 +104,7 @@ def from_file(
         raise ValueError(f"the applied_scale is {applied_scale}, not a positive number")
     back = inverse(matrix[:3])
     shift = frame[:, :3] @ back[:, 3:] + frame[:, 3:]
-    return torch.cat([frame[:, :3] @ back[:, :3], shift], dim=1) / applied_scale
+    return (torch.cat([frame[:, :3] @ back[:, :3], shift], dim=1) / applied_scale).to(dtype)
 
 
 def between(host: list[list[float]], other: list[list[float]]) -> Tensor:
