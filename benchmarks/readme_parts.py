@@ -13,6 +13,7 @@ from chart_sections import by_scene, longer, star, stored, titles
 from page_parts import RESULTS, between, heading_anchor, noted, table
 from walk import with_walk
 
+from leco_plugin.chart.contender import LEARNED
 from leco_plugin.chart.learned import last_gain
 from leco_plugin.chart.summary import Line, compare, describe_seeds, lines_of
 from leco_plugin.evaluation.report import describe_cores
@@ -127,7 +128,8 @@ def half_an_hour() -> str:
 
 def _ranked(results: Mapping[str, Any]) -> list[Line]:
     """The rows of a chart: that with a learned occupancy, then the best first."""
-    return sorted(lines_of(results), key=lambda line: (not line.learned, -line.psnr))
+    lines = lines_of(results)
+    return sorted(lines, key=lambda one: (one.sampler != LEARNED, not one.learned, -one.psnr))
 
 
 def _stands(ours: Line, other: Line) -> str:
@@ -147,32 +149,70 @@ def _of_five_minutes() -> dict[str, Mapping[str, Any]]:
 def in_five_minutes() -> str:
     """What Instant-NGP has after 300 s, and its best other row, scene by scene; nothing where no
     such chart is stored."""
-    parts = []
+    parts, grids = [], []
     for name, results in _of_five_minutes().items():
-        ours, best = _ranked(results)[:2]
+        ours, taught, others = _by_occupancy(results)
         scene = f"{ours.psnr:.1f} dB on `{results['scene']['name']}`{star(name)}"
-        rival = f"{_of_host(best, 'Instant-NGP')} ({best.psnr:.1f}; {describe_seeds(results)})"
-        parts.append(f"{scene}, {_stands(ours, best)} {rival}")
-    return f"**After 300 s** Instant-NGP has {' and '.join(parts)}. " if parts else ""
+        rival = f"{_of_host(others[0], 'Instant-NGP')} ({others[0].psnr:.1f})"
+        parts.append(f"{scene}, {_stands(ours, others[0])} {rival}")
+        if taught:
+            less = [f"{line.psnr:.1f} with {_cells_of(line)}" for line in taught[1:]]
+            facts = f"{_cells_of(taught[0])}, {_megabytes(taught[0])} MB"
+            stands = compare(taught[0].psnrs, ours.psnrs).word or "beside"
+            found = "; ".join([f"{facts}, {stands}", *less])
+            grids.append(f"{taught[0].psnr:.1f} ({found})")
+            size = _megabytes(ours)
+    if not parts:
+        return ""
+    said = f"**After 300 s** ({_seeds_of_five_minutes()}) Instant-NGP has {'; '.join(parts)}. "
+    if grids:
+        said += (
+            f"A grid that learns as the gate does, in place of the gate's {size} MB, ends at "
+            f"{', '.join(grids)}. "
+        )
+    return said
 
 
 def after_five_minutes() -> str:
     """How Instant-NGP stands beside its other rows after 300 s, scene by scene; nothing where no
     such chart is stored."""
-    charts = _of_five_minutes()
     parts = []
-    for name, results in charts.items():
-        ours, *rivals = _ranked(results)
-        beside = " and ".join(_beside(ours, rival, "Instant-NGP") for rival in rivals)
-        clear = min(ours.psnrs) > max(psnr for rival in rivals for psnr in rival.psnrs)
+    for name, results in _of_five_minutes().items():
+        ours, taught, others = _by_occupancy(results)
+        beside = " and ".join(_beside(ours, rival, "Instant-NGP") for rival in others)
+        clear = min(ours.psnrs) > max(psnr for rival in others for psnr in rival.psnrs)
+        grids = " and ".join(_beside(ours, rival, "Instant-NGP") for rival in taught)
         parts.append(
-            f"on `{results['scene']['name']}` {ours.psnr:.1f} dB "
+            f"- On `{results['scene']['name']}` {ours.psnr:.1f} dB "
             f"([figures](measurements.md#{heading_anchor(titles()[name])})){star(name)}, {beside}"
             + ("; each seed is ahead of each of theirs" if clear else "")
+            + (f". {grids[0].upper()}{grids[1:]}" if grids else "")
+            + "."
         )
-    given = " and ".join(dict.fromkeys(describe_seeds(results) for results in charts.values()))
-    begin = f"**After 300 s** ({given}) Instant-NGP with a learned occupancy has"
-    return f"{begin} {'; '.join(parts)}." if parts else ""
+    begin = f"**After 300 s** ({_seeds_of_five_minutes()}) Instant-NGP with a learned occupancy has"
+    return "\n".join([f"{begin}:", "", *parts]) if parts else ""
+
+
+def _seeds_of_five_minutes() -> str:
+    return " and ".join(dict.fromkeys(map(describe_seeds, _of_five_minutes().values())))
+
+
+def _by_occupancy(results: Mapping[str, Any]) -> tuple[Line, list[Line], list[Line]]:
+    """The row with our gate; those with another that learned as it did; those that learned none."""
+    ours, *others = _ranked(results)
+    return ours, [line for line in others if line.learned], [
+        line for line in others if not line.learned
+    ]
+
+
+def _cells_of(line: Line) -> str:
+    """Cells of a taught grid, from its name."""
+    return f"{line.name.split()[-1]} cells"
+
+
+def _megabytes(line: Line) -> str:
+    """Of its file."""
+    return f"{statistics.median(run['occupancy']['bytes'] for run in line.runs) / 1e6:.2g}"
 
 
 def without_gifts(results: Mapping[str, Any]) -> str:

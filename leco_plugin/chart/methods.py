@@ -26,14 +26,18 @@ from leco_plugin.host_configs import switch_nerf_host
 from leco_plugin.hosts.guided import GuidedModelConfig
 from leco_plugin.hosts.guided_start import OWN_SAMPLER
 from leco_plugin.method_configs import LEARNING, ON_GPU
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.gate import GateConfig, check_sizes
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.switch.field import SwitchNerfModelConfig
 from leco_plugin.names import unknown_name
+from leco_plugin.samplers.registry import SamplerSpec
 from leco_plugin.samplers.registry import samplers as registered_samplers
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.swap import registered
 
-SIZED_GRID = re.compile(rf"{GRID}-(\d+)")
+TAUGHT_GRID = f"{LEARNED}-grid"
+SIZED_GRID = re.compile(rf"({GRID}|{TAUGHT_GRID})-(\d+)")
 
 LONGER = 4
 """Times as long as a host's own steps are long steps."""
@@ -77,7 +81,6 @@ SAMPLER_NAMES = {
     "learned-occupancy-hash": "hash-grid gate",
     "learned-occupancy-vm": "TensoRF gate",
     "learned-occupancy-k-planes": "K-planes gate",
-    "learned-occupancy-grid": "taught grid",
     DENSE: "every sample",
     LONG_STEPS: "long steps, no skipping",
     WITHOUT_GIFTS: "learned occupancy without gifts",
@@ -96,11 +99,16 @@ def contenders(methods: Sequence[str], samplers: Sequence[str] = ()) -> list[Con
         )
     known = [*registered_samplers(), f"{GRID}-128", OWN_SAMPLER, LONG_STEPS, WITHOUT_GIFTS]
     for sampler in samplers:
-        sized = SIZED_GRID.fullmatch(sampler)
-        if sampler not in known and not sized:
+        name, cells = _name_and_cells(sampler)
+        if sampler not in known and cells is None:
             raise InputError(unknown_name("sampler", sampler, sorted(known)))
-        if sized and int(sized[1]) < 2:
-            raise InputError(f"the sampler {sampler!r} has too few cells: {GRID}-2 has the fewest")
+        if cells is not None and cells < 2:
+            raise InputError(f"the sampler {sampler!r} has too few cells: {name}-2 has the fewest")
+        if cells is not None and name == TAUGHT_GRID:
+            try:
+                check_sizes(GateConfig(EncodingConfig("grid", plane_cells=cells)))
+            except ValueError as error:
+                raise InputError(f"the sampler {sampler!r} has too many cells: {error}") from None
     found: dict[str, Contender] = {}
     used: set[str] = set()
     for method in dict.fromkeys(methods):
@@ -117,6 +125,12 @@ def contenders(methods: Sequence[str], samplers: Sequence[str] = ()) -> list[Con
     if unused:
         raise InputError(f"the sampler {unused[0]!r} fits none of {', '.join(methods)}")
     return list(found.values())
+
+
+def _name_and_cells(sampler: str) -> tuple[str, int | None]:
+    """A sampler without the cells along an axis that its name may end with, and those."""
+    sized = SIZED_GRID.fullmatch(sampler)
+    return (sized[1], int(sized[2])) if sized else (sampler, None)
 
 
 def _samplers_of(method: str) -> tuple[list[str], str]:
@@ -150,17 +164,31 @@ def _contender_of(method: str, sampler: str) -> Contender | None:
     called = METHOD_NAMES.get(method, method)
     if sampler == DENSE:
         return replace(NEVER_FROZEN, name=f"{called}, never frozen", method=method)
-    spec = registered_samplers().get(sampler)
+    base, cells = _name_and_cells(sampler)
+    spec = registered_samplers().get(base)
     if spec is None or not spec.needs_occupancy:
         return None
-    name, kind = f"{called} + {SAMPLER_NAMES.get(sampler, sampler)}", spec.gate_encoding
-    return Contender(name, method, sampler, {"sizes.gate.encoding.kind": kind} if kind else {})
+    shown, changes = _gate_of(base, spec, cells)
+    return Contender(f"{called} + {shown}", method, base, changes)
+
+
+def _gate_of(sampler: str, spec: SamplerSpec, cells: int | None) -> tuple[str, dict[str, Any]]:
+    """What a sampler is called in charts, and the changes that make a gate for it be learned."""
+    if spec.gate_encoding is None:
+        return SAMPLER_NAMES.get(sampler, sampler), {}
+    changes: dict[str, Any] = {"sizes.gate.encoding.kind": spec.gate_encoding}
+    if sampler != TAUGHT_GRID:
+        return SAMPLER_NAMES.get(sampler, sampler), changes
+    usual = EncodingConfig().plane_cells
+    if cells not in (None, usual):
+        changes["sizes.gate.encoding.plane_cells"] = cells
+    return f"taught grid {cells or usual}³", changes
 
 
 def contender_of_host(method: str, sampler: str, host: Any) -> Contender | None:
     """A host, by its model's config, with a sampler of its kind; None for one of another kind."""
     proposes = hasattr(host, "num_proposal_samples_per_ray")
-    sized = SIZED_GRID.fullmatch(sampler)
+    sampler, cells = _name_and_cells(sampler)
     shown = SAMPLER_NAMES.get(sampler, sampler)
     changes: dict[str, Any] = {"occupancy.sampler": sampler}
     if sampler == OWN_SAMPLER:
@@ -172,15 +200,15 @@ def contender_of_host(method: str, sampler: str, host: Any) -> Contender | None:
             return None if longer is None else Contender(name, method, sampler, longer)
         if sampler == WITHOUT_GIFTS:
             changes = {"occupancy.sampler": LEARNED, **NO_GIFTS}
-        spec = registered_samplers()[GRID if sized else changes["occupancy.sampler"]]
+        spec = registered_samplers()[changes["occupancy.sampler"]]
         if (spec.proposal if proposes else spec.estimator) is None:
             return None
         if sampler == DENSE and hasattr(host, "cone_angle"):  # as far as its own grid goes
             changes["occupancy.options"] = {"levels": getattr(host, "grid_levels", 1)}
-        if spec.gate_encoding is not None:
-            changes["occupancy.learning.sizes.gate.encoding.kind"] = spec.gate_encoding
-        if sized or sampler == GRID:
-            cells = int(sized[1]) if sized else _own_cells_of(host) or 128
+        shown, of_gate = _gate_of(sampler, spec, cells)
+        changes |= {f"occupancy.learning.{path}": value for path, value in of_gate.items()}
+        if sampler == GRID:
+            cells = cells or _own_cells_of(host) or 128
             sampler = f"{GRID}-{cells}"  # one key for each grid, however it was named
             shown, changes = f"grid {cells}³", _grid_changes(host, cells)
     return Contender(f"{METHOD_NAMES.get(method, method)} + {shown}", method, sampler, changes)

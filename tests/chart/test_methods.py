@@ -77,6 +77,19 @@ def test_another_kind_of_gate_is_learned_with_its_own_features() -> None:
     assert hosted.changes["occupancy.sampler"] == "learned-occupancy-k-planes"
 
 
+def test_a_taught_grid_has_the_cells_that_its_name_says() -> None:
+    ways = ["learned-occupancy-grid", "learned-occupancy-grid-128", "learned-occupancy-grid-32"]
+    usual, small = contenders(["leco-ngp"], ways)
+    assert [usual.name, small.name] == [f"Instant-NGP + taught grid {n}³" for n in (128, 32)]
+    gates = []
+    for one in (usual, small, *contenders(["leco-occupancy"], ways)):
+        model: Any = config_of(one, Path("scene"), Path("runs")).pipeline.model
+        guided = one.method == "leco-ngp"
+        sizes = model.occupancy.learning.sizes if guided else model.sizes
+        gates.append((sizes.gate.encoding.kind, sizes.gate.encoding.plane_cells))
+    assert gates == [("grid", 128), ("grid", 32)] * 2
+
+
 def test_an_occupancy_grid_has_the_cells_that_its_name_says_and_the_levels_of_the_host() -> None:
     (one,) = contenders(["leco-ngp"], ["occupancy-grid-96"])
     options = {"resolution": 96, "levels": ngp_host().grid_levels}
@@ -180,6 +193,8 @@ def test_what_is_asked_for_twice_is_made_once() -> None:
         (["leco-ngp"], ["occupancy-grid-"], "no sampler"),
         (["leco-ngp"], ["occupancy-grid-0"], "'occupancy-grid-0' has too few cells"),
         (["leco-ngp"], ["occupancy-grid-01"], "'occupancy-grid-01' has too few cells"),
+        (["leco-ngp"], ["learned-occupancy-grid-1"], "has too few cells"),
+        (["leco-ngp"], ["learned-occupancy-grid-500"], "too many cells: .* 251511967 values"),
         (["leco-occupancy"], ["own"], "leco-occupancy has none of the samplers own"),
         (["leco-nerfacto"], ["dense"], "leco-nerfacto has none of the samplers dense"),
         (["leco-nerfacto"], ["own", "dense"], "'dense' fits none of leco-nerfacto"),
