@@ -149,28 +149,33 @@ def _of_five_minutes() -> dict[str, Mapping[str, Any]]:
 def in_five_minutes() -> str:
     """What Instant-NGP has after 300 s, and its best other row, scene by scene; nothing where no
     such chart is stored."""
-    parts, grids = [], []
+    parts, beside_grids = [], []
     for name, results in _of_five_minutes().items():
         ours, taught, others = _by_occupancy(results)
         scene = f"{ours.psnr:.1f} dB on `{results['scene']['name']}`{star(name)}"
         rival = f"{_of_host(others[0], 'Instant-NGP')} ({others[0].psnr:.1f})"
         parts.append(f"{scene}, {_stands(ours, others[0])} {rival}")
-        if taught:
-            less = [f"{line.psnr:.1f} with {_cells_of(line)}" for line in taught[1:]]
-            facts = f"{_cells_of(taught[0])}, {_megabytes(taught[0])} MB"
-            stands = compare(taught[0].psnrs, ours.psnrs).word or "beside"
-            found = "; ".join([f"{facts}, {stands}", *less])
-            grids.append(f"{taught[0].psnr:.1f} ({found})")
-            size = _megabytes(ours)
+        beside_grids += [(ours, taught)] if taught else []
     if not parts:
         return ""
     said = f"**After 300 s** ({_seeds_of_five_minutes()}) Instant-NGP has {'; '.join(parts)}. "
-    if grids:
-        said += (
-            f"A grid that learns as the gate does, in place of the gate's {size} MB, ends at "
-            f"{', '.join(grids)}. "
-        )
-    return said
+    return f"{said}{_beside_taught_grids(beside_grids)}"
+
+
+def _beside_taught_grids(rows: Sequence[tuple[Line, Sequence[Line]]]) -> str:
+    """How taught grids of the best and of the worst size end, scene by scene, and what they take;
+    nothing where there are none."""
+    if not rows:
+        return ""
+    best, worst = (", ".join(f"{taught[i].psnr:.1f}" for _, taught in rows) for i in (0, -1))
+    words = dict.fromkeys(_stands(ours, taught[0]) for ours, taught in rows)
+    sizes = sorted({_megabytes(line) for _, taught in rows for line in taught}, key=float)
+    return (
+        f"A grid that learns as the gate does ends at {best} with the best size that was tried "
+        f"(the gate is {' or '.join(words)} it), at {worst} with the worst; "
+        f"its file takes {' to '.join((sizes[0], sizes[-1]))} MB, the gate's "
+        f"{_megabytes(rows[0][0])}. "
+    )
 
 
 def after_five_minutes() -> str:
@@ -200,14 +205,11 @@ def _seeds_of_five_minutes() -> str:
 def _by_occupancy(results: Mapping[str, Any]) -> tuple[Line, list[Line], list[Line]]:
     """The row with our gate; those with another that learned as it did; those that learned none."""
     ours, *others = _ranked(results)
-    return ours, [line for line in others if line.learned], [
-        line for line in others if not line.learned
-    ]
-
-
-def _cells_of(line: Line) -> str:
-    """Cells of a taught grid, from its name."""
-    return f"{line.name.split()[-1]} cells"
+    return (
+        ours,
+        [line for line in others if line.learned],
+        [line for line in others if not line.learned],
+    )
 
 
 def _megabytes(line: Line) -> str:

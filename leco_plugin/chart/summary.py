@@ -6,6 +6,7 @@ import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from operator import eq
 from typing import Any, Literal
 
@@ -282,13 +283,16 @@ def headline(results: Mapping[str, Any], short: bool = False) -> str:
     said = f"{best.name} and {second.name} are {found.word}: {figures}"
     others = [line for line in ranked if not line.learned]
     if best.learned and second.learned and others:
-        leads = [compare(line.psnrs, others[0].psnrs) for line in (best, second)]
-        if all(lead.word == "ahead" for lead in leads):  # then they have margins
-            least = f"{leads[1].difference:.2f} ± {leads[1].margin:.2f}"
+        with_leads = [(line, compare(line.psnrs, others[0].psnrs)) for line in ranked]
+        leaders = [*takewhile(lambda pair: pair[0].learned and pair[1].word == "ahead", with_leads)]
+        if len(leaders) > 1:  # and each has a margin
+            last, lead = leaders[-1]
+            least = f"{lead.difference:.2f} ± {lead.margin:.2f}"
             if short:
-                return f"two methods with learned occupancy lead by {least} dB"
+                number = {2: "two", 3: "three"}.get(len(leaders), str(len(leaders)))
+                return f"{number} methods with learned occupancy lead by {least} dB"
             name = f"{others[0].name}, the best of the others"
-            return f"{said}; {name}, is {least} behind {second.name}"
+            return f"{said}; {name}, is {least} behind {last.name}"
     if short and found.word == "level":
         return f"{best.name} is level with the next best"
     return f"undecided: {both_figures}" if short else said

@@ -103,6 +103,9 @@ def test_where_two_that_learn_are_level_the_headline_says_what_they_lead_the_oth
     said = "two methods with learned occupancy lead by 1.47 ± 0.31 dB"  # B, the second
     assert headline(ahead, short=True) == said
     assert headline(ahead).endswith("; C, the best of the others, is 1.47 ± 0.31 behind B")
+    third = results(*ahead["runs"], *of("E", 21.2, 21.3, 21.4))
+    said = "three methods with learned occupancy lead by 1.30 ± 0.23 dB"  # E, the third
+    assert headline(third, short=True) == said
     close = results(*both, *of("C", 18.0, 22.0, 23.0, **dense))
     assert headline(close, short=True) == "A is level with the next best"
     assert "behind" not in headline(close)
