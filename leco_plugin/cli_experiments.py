@@ -35,10 +35,9 @@ def chart(
         data: A scene in nerfstudio's format.
         out: Folder of the chart. More methods and seeds may be added to it later.
         methods: As ns-train knows them, or leco-occupancy-never-frozen, -retrained, -homogeneous.
-        samplers: Of the registry; occupancy-grid-N or learned-occupancy-grid-N for N cells along an
-            axis; own; long-steps, 4 times as long, none skipped; learned-occupancy-without-gifts,
-            with neither sparse points nor an opaque start. By default learned-occupancy, own and,
-            where it can be, long-steps.
+        samplers: Of the registry; occupancy-grid-N or learned-occupancy-grid-N, N cells an axis;
+            own; long-steps, 4 times as long, none skipped; learned-occupancy-without-gifts, without
+            sparse points and opaque start. By default learned-occupancy, own, perhaps long-steps.
         suite: A named comparison instead of methods and samplers. Minutes that it takes on two CPU
             cores with three seeds, by their speed: representations 12 to 30, empty-expert 14 to 34,
             losses 9 to 22, freeze 13 to 16, enough-time 16 to 18, grid-resolution 19 to 21. Several
