@@ -237,9 +237,9 @@ def read_frame(metadata: Path, image: Path) -> Frame:
     intrinsics = _numbers(metadata, values, "intrinsics", (4,))
     if intrinsics[:2].min() <= 0:
         raise InputError(f"{metadata}: a focal length in intrinsics is not above 0")
-    header = header_of(image)
+    header = header_of(image, turned=False)
     if header.format not in KINDS:
-        raise InputError(f"{image} is a file of {header.format}, and a picture is a JPEG or PNG")
+        raise InputError(f"{image} is a file of {header.format}: save it as JPEG or PNG")
     size = header.size
     if abs(size[0] * height - size[1] * width) > max(width, height):
         raise InputError(

@@ -166,7 +166,7 @@ def scaled(frame: Frame, factor: int) -> tuple[int, int]:
 def picture_of(frame: Frame, factor: int, right_half: bool, derived: DerivedImages) -> Path:
     """A file with the picture, resized as Mega-NeRF does it, or with its right half only."""
     size = scaled(frame, factor)
-    header = header_of(frame.image)
+    header = header_of(frame.image, turned=False)
     check_kind(frame.image, header)
     if frame.image_size == size and is_plain(header) and not right_half:
         return frame.image
@@ -207,7 +207,7 @@ def mask_of(
 
     path = derived.get(source, f"{frame.width, frame.height} {size} {left_half}", make)
     # a mask that keeps nothing is kept as one pixel, so that its header says so
-    return None if header_of(path).size != size else path
+    return None if header_of(path, turned=False).size != size else path
 
 
 def _cut(mask: Image.Image, left_half: bool) -> Image.Image:

@@ -72,14 +72,16 @@ def opened(path: Path) -> Iterator[Image.Image]:
             yield image
 
 
-def header_of(path: Path) -> Header:
-    """What a file of an image says. InputError if it is none."""
+def header_of(path: Path, turned: bool = True) -> Header:
+    """What a file of an image says. InputError if it is none. Unless it may be `turned`, it counts
+    as upright: to look for an orientation, which may stand behind the pixels, Pillow decodes a PNG.
+    """
     try:
         with opened(path) as image:
             several = image.format != "MPO" and getattr(image, "n_frames", 1) > 1
             transparent = image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info
-            size, turned = _size_and_orientation(image)
-            return Header(size, image.mode, transparent, turned, several, image.format or "")
+            size, how = _size_and_orientation(image) if turned else (image.size, 1)
+            return Header(size, image.mode, transparent, how, several, image.format or "")
     except Image.DecompressionBombError:
         most = f"{2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f} megapixels that Pillow opens"
         raise InputError(f"{path} has more than the {most}: make it smaller") from None

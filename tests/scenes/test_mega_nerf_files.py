@@ -126,6 +126,10 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda s: (s / "train/rgbs/000003.png").write_bytes(b"\x89PNG"),
         r"000003\.png cannot be read as an image",
     ),
+    "a picture of another kind": (
+        lambda s: Image.new("L", (24, 16)).save(s / "train/rgbs/000003.png", format="GIF"),
+        r"000003\.png is a file of GIF: save it as JPEG or PNG",
+    ),
 }
 
 

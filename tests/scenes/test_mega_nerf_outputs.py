@@ -12,6 +12,7 @@ import pytest
 import torch
 from mega_nerf_scene import pack, write_mask, zipped
 from PIL import Image
+from PIL.PngImagePlugin import PngImageFile
 from scene_files import refused
 
 from leco_plugin.scenes.mega_nerf_files import Frame, read_scene
@@ -44,6 +45,20 @@ def test_a_picture_of_the_right_size_is_the_file_itself(
 ) -> None:
     assert picture_of(frame, 1, False, derived) == frame.image
     assert not derived.folder.exists()
+
+
+def test_no_pixel_is_decoded_before_a_picture_is_made(
+    scene: Path, derived: DerivedImages, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To look for an orientation Pillow decodes a PNG: of a large scene that takes minutes."""
+    masks = scene / "masks"
+    frames = read_scene(scene).frames
+    made = [mask_of(frame, 1, False, masks, derived) for frame in frames]
+    monkeypatch.setattr(PngImageFile, "load", lambda image: pytest.fail("decoded"))
+    assert len(read_scene(scene).frames) == len(frames)
+    for frame, mask in zip(frames, made):
+        assert picture_of(frame, 1, False, derived) == frame.image
+        assert mask_of(frame, 1, False, masks, derived) == mask
 
 
 def test_a_smaller_picture_is_resized_by_lanczos(frame: Frame, derived: DerivedImages) -> None:
