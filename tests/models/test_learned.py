@@ -17,6 +17,7 @@ from leco_plugin.models.rendering import Intervals, Rays, composite
 from leco_plugin.samplers.kernels import VARIABLE
 
 pytestmark = pytest.mark.skipif(not native.has_native(), reason="no C compiler")
+ROWS = torch.contiguous_format
 Answer = Callable[[], tuple[Tensor, ...]]
 
 
@@ -112,6 +113,23 @@ def test_a_gradient_of_a_gradient_is_refused() -> None:
     first = torch.autograd.grad(total, gate.head.weight, create_graph=True)[0]
     with pytest.raises(RuntimeError, match="once_differentiable"):
         first.sum().backward()
+
+
+def test_what_is_kept_for_gradients_may_come_back_in_other_strides() -> None:
+    """As of torch's `save_on_cpu`, which keeps it in memory of its own."""
+    torch.manual_seed(0)
+    gate, mapped = Gate(GateConfig(width=16, layers=1)), torch.rand(3, 9).t()
+
+    def gradient() -> Tensor:
+        gate.zero_grad()
+        gate(mapped).square().sum().backward()
+        return gate.hidden[0].weight.grad.clone()
+
+    expected = gradient()
+    with torch.autograd.graph.saved_tensors_hooks(
+        lambda x: x.clone(memory_format=ROWS), lambda x: x
+    ):
+        torch.testing.assert_close(gradient(), expected)
 
 
 def test_what_is_no_number_stays_none() -> None:

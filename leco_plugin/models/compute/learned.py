@@ -71,6 +71,11 @@ def _total(part: Tensor | None, found: Sequence[Tensor | None]) -> Tensor | None
     return whole[:rows, :columns].contiguous().view_as(part)
 
 
+def _strides(positions: Tensor) -> tuple[ctypes.c_int64, ctypes.c_int64]:
+    """Of positions [N, 3]: from one coordinate to the next, and from one position to the next."""
+    return ctypes.c_int64(positions.stride(1)), ctypes.c_int64(positions.stride(0))
+
+
 class GateLogits(torch.autograd.Function):
     """Logits [N, 1 + n] of a gate on frequencies; positions receive no gradient.
 
@@ -89,13 +94,11 @@ class GateLogits(torch.autograd.Function):
     ) -> Tensor:
         ctx.save_for_backward(mapped, scales, *parts)
         layers, width, outputs = len(parts) // 2 - 2, len(parts[0]), len(parts[-1])
-        strides = ctypes.c_int64(mapped.stride(1)), ctypes.c_int64(mapped.stride(0))
-        sizes = len(scales), fresh, layers, width, outputs, ctypes.c_float(epsilon)
-        ctx.after = *strides, *sizes
+        ctx.sizes = len(scales), fresh, layers, width, outputs, ctypes.c_float(epsilon)
         logits = mapped.new_empty(len(mapped), outputs)
         whole = native.addresses_of(parts)
         given = *native.pointers_to(mapped, scales), whole, *native.pointers_to(logits)
-        native.of_points("gate_logits", given, len(mapped), ctx.after)
+        native.of_points("gate_logits", given, len(mapped), (*_strides(mapped), *ctx.sizes))
         return logits
 
     @staticmethod
@@ -106,11 +109,12 @@ class GateLogits(torch.autograd.Function):
         of_norm = [_padded(each)[0] for each in parts[-4:-2]]
         whole = [*_layers(parts[:-4]), *of_norm, *_layers(parts[-2:])]
         read = *native.pointers_to(mapped, scales), native.addresses_of(whole)
+        after = *_strides(mapped), *ctx.sizes  # what is kept may have others than what was given
 
         def call(routine: Any, found: list[Tensor | None], begin: int, end: int) -> int:
             part = ctypes.c_int64(begin), ctypes.c_int64(end)
             places = *native.pointers_to(given), native.addresses_of(found)
-            made: int = routine(*read, *places, *part, *ctx.after)
+            made: int = routine(*read, *places, *part, *after)
             return made
 
         found = _run("gate_gradients", parts, call, len(mapped))
