@@ -239,10 +239,11 @@ def check_memory(sizes: Sizes, images: int, memory: int) -> None:
     """ValueError, in one line, if training needs more than these bytes of a device."""
     needed = state_bytes(sizes, images)
     if needed > memory:
+        lower = {"frequency": "experts.width", "hash": "encoding.log2-table"}
+        largest = lower.get(sizes.field.encoding.kind, "encoding.plane-cells")
         raise ValueError(
             f"training gate and field of these sizes takes {needed / 1e9:.1f} GB for weights and "
-            f"optimizer alone, and the device has {memory / 1e9:.1f}: lower "
-            f"{CLI}.field.encoding.log2-table"
+            f"optimizer alone, and the device has {memory / 1e9:.1f}: lower {CLI}.field.{largest}"
         )
 
 

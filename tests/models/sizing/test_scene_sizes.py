@@ -217,6 +217,10 @@ def changed(path: str, value: int) -> Sizes:
         ),
         (changed("candidates", 0), "candidates is 0"),
         (changed("field.encoding.log2_table", 27), "takes .* GB .*log2-table"),
+        (
+            with_size(changed("field.encoding.kind", "grid"), "field.encoding.plane_cells", 1024),
+            "takes .* GB .*plane-cells",
+        ),
     ],
 )
 def test_sizes_that_cannot_be_are_refused_in_one_line(wanted: Sizes, says: str) -> None:
