@@ -202,8 +202,7 @@ def test_no_file_is_long() -> None:
     assert {name: lines for name, lines in lengths.items() if lines > MOST_LINES} == {}
 
 
-def test_no_function_is_long_but_those_that_are_named() -> None:
-    """What is short again leaves the list."""
+def test_no_function_is_long() -> None:
     assert not long_functions()
 
 
