@@ -312,10 +312,9 @@ def copy_photographs(found: Found, folder: Path) -> Found:
 
 
 def _write(photograph: Photograph, image: Image.Image, path: Path) -> None:
-    with writing_into(path.parent, "--out"):
+    with photograph.path.open("rb") as source, writing_into(path.parent, "--out"):
         if photograph.is_copied:
-            with photograph.path.open("rb") as source:
-                write_whole(path, lambda file: shutil.copyfileobj(source, file))
+            write_whole(path, lambda file: shutil.copyfileobj(source, file))
             return
         kind = "PNG" if path.suffix.lower() == ".png" else "JPEG"
         options: dict[str, Any] = {"exif": _upright_exif(image, kind)}

@@ -13,6 +13,8 @@ from PIL import Image
 from rendered_survey import exif_of, odd_exif
 
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.photograph_files import decode
+from leco_plugin.scenes.poses import originals
 from leco_plugin.scenes.poses.originals import copy_photographs, find_photographs
 
 
@@ -253,6 +255,19 @@ def test_the_longest_name_in_letters_of_several_bytes_is_written(
 def test_a_copy_that_cannot_be_written_ends_the_work(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "out").write_bytes(b"a file where the folder should be")
     with pytest.raises(InputError, match=r"nothing can be written into .*--out$"):
+        copies(folder, tmp_path / "out")
+
+
+def test_a_photograph_that_goes_away_is_named_and_not_the_place_of_its_copy(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def gone(path: Path, turn: bool) -> Image.Image:
+        image = decode(path, turn)
+        path.unlink()
+        return image
+
+    monkeypatch.setattr(originals, "decode", gone)
+    with pytest.raises(OSError, match=r"No such file .*photos/IMG_0\.jpg"):
         copies(folder, tmp_path / "out")
 
 
