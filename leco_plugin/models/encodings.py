@@ -37,8 +37,8 @@ class EncodingConfig:
     finest: int = 1024
     """Hash: cells along the cube at the finest level."""
     plane_cells: int = 128
-    """VM, and the finest level of K-planes: cells along the cube; memory grows with the square.
-    Grid: the same; memory grows with the cube."""
+    """VM, grid, and the finest level of K-planes: cells along the cube. Memory grows with their
+    square; of a grid, with their third power."""
 
 
 FRESH = {torch.float32: 4, torch.float16: 6, torch.bfloat16: 8}
@@ -294,7 +294,7 @@ class KPlanesEncoding(nn.Module):
 
 class GridEncoding(nn.Module):
     """Features at the corners of one grid of cells, interpolated in between (Sun et al. 2022, DVGO,
-    eq. 4): the occupancy grid that has a gate's teacher. Positions receive no gradient."""
+    eq. 4): an occupancy grid that learns as a gate does. Positions receive no gradient."""
 
     def __init__(self, features: int, cells: int) -> None:
         super().__init__()

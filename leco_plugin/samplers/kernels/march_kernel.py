@@ -191,7 +191,7 @@ def _march_kernel(
 
 
 def march_kept(cache: CellCache, weights: GateWeights, candidates: Candidates) -> Samples:
-    """As `marching.march` returns it, what is kept of rays, with one wait for the device.
+    """Packed kept intervals of rays, as of `marching.march`, with one wait for the device.
 
     Args:
         cache: the cells of the gate's decisions.
