@@ -219,8 +219,10 @@ def grid_buffers(
             "the scene is unbounded, and a grid of one level ends at its innermost box: give two "
             "levels or more, or none to have them counted"
         )
-    inner = whole_box(occupancy)
-    corners = torch.cat([inner.low, inner.high])
+    inner, center, half = whole_box(occupancy), occupancy.space.center, occupancy.space.half_extent
+    # `reaching_levels` counts from the whole cube, of which walls cut nothing off
+    ends = [center - half, center + half] if unbounded else [inner.low, inner.high]
+    corners = torch.cat(ends).cpu()
     nested = OccupancyGridEstimator(corners, 1, levels)  # for its boxes alone
     largest, done = torch.empty(levels * resolution, resolution, resolution), 0
     with bar(f"Asking the gate about {resolution}^3 cells a level") as show:

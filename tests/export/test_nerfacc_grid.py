@@ -103,6 +103,14 @@ def test_an_unbounded_scene_gets_levels_as_far_as_its_rays() -> None:
     assert "\n" not in str(error.value)
 
 
+def test_boxes_of_an_unbounded_scene_reach_as_far_with_walls_as_without() -> None:
+    """A wall on one side would else make them smaller, and move them to the other side."""
+    free = unbounded(far=3.0, cameras=[list(CENTRE)])
+    ground = torch.tensor([-1e6, -1e6, CENTRE[2], 1e6, 1e6, 1e6])
+    cut = Occupancy(free.gate, free.space, free.threshold, report=free.report, walls=ground)
+    assert torch.equal(grid_buffers(cut, 4)["aabbs"], grid_buffers(free, 4)["aabbs"])
+
+
 @pytest.mark.parametrize(("resolution", "levels"), [(0, 1), (4, 0), (4, 65), (1024, 1)])
 def test_sizes_out_of_range_are_refused(resolution: int, levels: int) -> None:
     with pytest.raises(ValueError, match="cells"):
