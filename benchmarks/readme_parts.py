@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import checkout  # noqa: F401
@@ -70,7 +70,7 @@ def after_half_an_hour() -> str:
     """What is left of the gain of the paper's model when there is time."""
     names = HALF_HOUR_CHARTS.values()
     here, there = (lines_of(stored(name)) for name in names)
-    seeds = " and ".join(dict.fromkeys(describe_seeds(stored(name)) for name in names))
+    seeds = _seeds_of(map(stored, names))
     old = ", made before a later change of the code" if star(*names) else ""
     return (
         f"**After half an hour** LeCO has {here[0].psnr:.1f} dB with a learned occupancy, "
@@ -150,7 +150,8 @@ def in_five_minutes() -> str:
     """What Instant-NGP has after 300 s, and its best other row, scene by scene; nothing where no
     such chart is stored."""
     parts, beside_grids = [], []
-    for name, results in _of_five_minutes().items():
+    charts = _of_five_minutes()
+    for name, results in charts.items():
         ours, taught, others = _by_occupancy(results)
         scene = f"{ours.psnr:.1f} dB on `{results['scene']['name']}`{star(name)}"
         rival = f"{_of_host(others[0], 'Instant-NGP')} ({others[0].psnr:.1f})"
@@ -158,7 +159,7 @@ def in_five_minutes() -> str:
         beside_grids += [(ours, taught)] if taught else []
     if not parts:
         return ""
-    said = f"**After 300 s** ({_seeds_of_five_minutes()}) Instant-NGP has {'; '.join(parts)}. "
+    said = f"**After 300 s** ({_seeds_of(charts.values())}) Instant-NGP has {'; '.join(parts)}. "
     return f"{said}{_beside_taught_grids(beside_grids)}"
 
 
@@ -181,8 +182,8 @@ def _beside_taught_grids(rows: Sequence[tuple[Line, Sequence[Line]]]) -> str:
 def after_five_minutes() -> str:
     """How Instant-NGP stands beside its other rows after 300 s, scene by scene; nothing where no
     such chart is stored."""
-    parts = []
-    for name, results in _of_five_minutes().items():
+    parts, charts = [], _of_five_minutes()
+    for name, results in charts.items():
         ours, taught, others = _by_occupancy(results)
         beside = " and ".join(_beside(ours, rival, "Instant-NGP") for rival in others)
         clear = min(ours.psnrs) > max(psnr for rival in others for psnr in rival.psnrs)
@@ -194,12 +195,14 @@ def after_five_minutes() -> str:
             + (f". {grids[0].upper()}{grids[1:]}" if grids else "")
             + "."
         )
-    begin = f"**After 300 s** ({_seeds_of_five_minutes()}) Instant-NGP with a learned occupancy has"
+    begin = (
+        f"**After 300 s** ({_seeds_of(charts.values())}) Instant-NGP with a learned occupancy has"
+    )
     return "\n".join([f"{begin}:", "", *parts]) if parts else ""
 
 
-def _seeds_of_five_minutes() -> str:
-    return " and ".join(dict.fromkeys(map(describe_seeds, _of_five_minutes().values())))
+def _seeds_of(charts: Iterable[Mapping[str, Any]]) -> str:
+    return " and ".join(dict.fromkeys(map(describe_seeds, charts)))
 
 
 def _by_occupancy(results: Mapping[str, Any]) -> tuple[Line, list[Line], list[Line]]:

@@ -174,15 +174,14 @@ def _contender_of(method: str, sampler: str) -> Contender | None:
 
 def _gate_of(sampler: str, spec: SamplerSpec, cells: int | None) -> tuple[str, dict[str, Any]]:
     """What a sampler is called in charts, and the changes that make a gate for it be learned."""
-    if spec.gate_encoding is None:
-        return SAMPLER_NAMES.get(sampler, sampler), {}
-    changes: dict[str, Any] = {"sizes.gate.encoding.kind": spec.gate_encoding}
-    if sampler != TAUGHT_GRID:
-        return SAMPLER_NAMES.get(sampler, sampler), changes
-    usual = EncodingConfig().plane_cells
-    if cells not in (None, usual):
-        changes["sizes.gate.encoding.plane_cells"] = cells
-    return f"taught grid {cells or usual}³", changes
+    shown, kind = SAMPLER_NAMES.get(sampler, sampler), spec.gate_encoding
+    changes: dict[str, Any] = {"sizes.gate.encoding.kind": kind} if kind else {}
+    if sampler == TAUGHT_GRID:
+        usual = EncodingConfig().plane_cells
+        shown = f"taught grid {cells or usual}³"
+        if cells not in (None, usual):  # one key for each grid, however it was named
+            changes["sizes.gate.encoding.plane_cells"] = cells
+    return shown, changes
 
 
 def contender_of_host(method: str, sampler: str, host: Any) -> Contender | None:

@@ -282,9 +282,9 @@ def headline(results: Mapping[str, Any], short: bool = False) -> str:
     figures = f"{best.psnr:.1f} and {second.psnr:.1f} dB, {apart} apart ({found.by})"
     said = f"{best.name} and {second.name} are {found.word}: {figures}"
     others = [line for line in ranked if not line.learned]
-    if best.learned and second.learned and others:
-        with_leads = [(line, compare(line.psnrs, others[0].psnrs)) for line in ranked]
-        leaders = [*takewhile(lambda pair: pair[0].learned and pair[1].word == "ahead", with_leads)]
+    if others:
+        leads = ((line, compare(line.psnrs, others[0].psnrs)) for line in ranked if line.learned)
+        leaders = [*takewhile(lambda pair: pair[1].word == "ahead", leads)]
         if len(leaders) > 1:  # and each has a margin
             last, lead = leaders[-1]
             least = f"{lead.difference:.2f} ± {lead.margin:.2f}"

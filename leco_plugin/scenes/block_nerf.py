@@ -71,10 +71,11 @@ def make_scene(records: Path, out: Path) -> dict[str, Any]:
 
         def rays_of(path: Path) -> NDArray[Any]:
             kept = out / READ / f"{_digest(path)}.npy"
-            if not kept.is_file():
-                rays = np.array([*_read(path, out)], dtype=RAYS)
-                write_whole(kept, lambda file: np.save(file, rays))
-            return np.asarray(np.load(kept))
+            if kept.is_file():
+                return np.asarray(np.load(kept))
+            rays = np.array([*_read(path, out)], dtype=RAYS)
+            write_whole(kept, lambda file: np.save(file, rays))
+            return rays
 
         found = for_each("Reading the records", files, rays_of)
         pictures = np.sort(np.concatenate(found), order=("name", "test"))

@@ -180,14 +180,14 @@ def read_scene(folder: Path, check_axes: bool = True) -> MegaNerfScene:
             raise InputError(f"{before.name} is both in train/metadata and in val/metadata")
     frames = for_each("Reading the scene", pairs, lambda pair: read_frame(*pair))
     scene = MegaNerfScene(coordinates, frames)
-    names = [f"{metadata}: c2w" for metadata, _ in pairs]
-    if (np.linalg.det(scene.poses()[:, :, :3]) < 0).all():
+    poses, names = scene.poses(), [f"{metadata}: c2w" for metadata, _ in pairs]
+    if (np.linalg.det(poses[:, :, :3]) < 0).all():
         raise InputError(
             f"{names[0]} is mirrored, as in all files: the axes of its world are not "
             "(down, right, back), perhaps the first one points up"
         )
-    check_poses(scene.poses(), names)
-    fault = wrong_axis(scene.poses()) if check_axes else None
+    check_poses(poses, names)
+    fault = wrong_axis(poses) if check_axes else None
     if fault is not None:
         raise InputError(
             f"{folder}: {fault}; the world of this format is (down, right, back), "

@@ -22,11 +22,16 @@ PADDED = 16
 Parts = Sequence[Tensor | None]
 
 
+def _room(part: Tensor) -> list[int]:
+    """Rows and columns of a part that is `_padded`."""
+    return [size + -size % PADDED for size in torch.atleast_2d(part).shape]
+
+
 def _padded(part: Tensor) -> Tensor:
     """A matrix, or a vector as one of a single row, with zeros in new rows and columns."""
-    matrix = torch.atleast_2d(part)
-    rows, columns = (-size % PADDED for size in matrix.shape)
-    return torch.nn.functional.pad(matrix, (0, columns, 0, rows))
+    matrix, (rows, columns) = torch.atleast_2d(part), _room(part)
+    more = 0, columns - matrix.shape[1], 0, rows - matrix.shape[0]
+    return torch.nn.functional.pad(matrix, more)
 
 
 def _layers(parts: Parts) -> list[Tensor | None]:
@@ -51,7 +56,7 @@ def _run(
     failed: list[int] = []
 
     def work(begin: int, end: int) -> None:
-        own = [None if part is None else torch.zeros_like(_padded(part)) for part in parts]
+        own = [None if part is None else part.new_zeros(_room(part)) for part in parts]
         sums[begin] = own
         failed.append(call(routine, own, begin, end))
 

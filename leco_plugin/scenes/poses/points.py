@@ -180,7 +180,8 @@ def _copies(
             seen.resize(copy.size, Image.Resampling.NEAREST).save(masks / f"{file.name}.png")
         camera = camera_of(lens, full, copy.size, str(path))
         lens_name = str(sorted(camera.todict().items(), key=str))  # shared by equal ones
-        return Photograph(file, file.name, header_of(file), Exif(camera=lens_name)), camera
+        header = header_of(file, turned=False)
+        return Photograph(file, file.name, header, Exif(camera=lens_name)), camera
 
     return for_each("reading photographs", chosen, copied)
 
