@@ -16,6 +16,7 @@ import checkout  # noqa: F401
 from answers import answers_section
 from bars import bars_section
 from chart_sections import chart_sections, star, stored, suite_sections, titles
+from comparisons import comparison_section, comparisons
 from eight_questions import eight_answers, scenes_and_seeds
 from growth_picture import cities, growth_table
 from large_scene_tables import LARGE_SCENES
@@ -36,12 +37,9 @@ from promises import kept_promises, promises_section
 from readme_parts import (
     GAIN_CHART,
     GIFTS_CHART,
-    after_five_minutes,
     demo_table,
     gain,
-    gains,
     gifts_sentence,
-    half_an_hour,
     readme,
 )
 from sharpening import kept_by_grids, sharpening_sections
@@ -54,14 +52,10 @@ from upstream_page import PAGE as UPSTREAM_PAGE
 from upstream_page import page as upstream_page
 from walk import with_walk
 
-from leco_plugin.chart.summary import lines_of
-
 PAGE = ROOT / "docs" / "results.md"
 MEASUREMENTS_PAGE = ROOT / "docs" / "measurements.md"
 SUITES_PAGE = ROOT / "docs" / "suites.md"
 README = ROOT / "README.md"
-STRETCH_CHART = "caliterra-stretch"
-"""As the chart of the gain, in benchmarks/results/charts, tested on a stretch of the flight."""
 
 WALKED = {
     ROOT / "docs" / "tutorial.md": ("poses", "train", "export"),
@@ -85,7 +79,7 @@ learning what is empty takes part of the time, and wins it back. On a CPU hosts 
 nerfstudio's: a hash table of 2^16 entries, a grid of 64³, 128 + 64 proposal samples and 32 of the
 field.
 
-{further}
+{gifts}
 
 The demo's city is known exactly, which photographs never are:
 """
@@ -272,25 +266,12 @@ def growth_section() -> list[str]:
     return [head, f"{picture(GROWTH.stem)}\n", *rest]
 
 
-def new_views() -> str:
-    """What is gained on photographs of a stretch that no other one shows so."""
-    chart = stored(STRETCH_CHART)
-    lines, anchor = lines_of(chart), heading_anchor(titles()[STRETCH_CHART])
-    seeds = max(len(line.runs) for line in lines)
-    return (
-        f"**On new views,** a whole stretch of {len(chart['held_out']['test'])} cameras held out "
-        f"with those beside it ([figures](measurements.md#{anchor}), {seeds} seeds), "
-        f"{gains(lines)}"
-    )
-
-
 def page() -> str:
     """The whole of `docs/results.md`."""
     demo = json.loads((RESULTS / "demo.json").read_text())
     anchor = heading_anchor(titles()[GAIN_CHART])
     gifts = gifts_sentence(stored(GIFTS_CHART), heading_anchor(titles()[GIFTS_CHART]))
-    further = "\n\n".join(filter(None, [gifts, new_views(), after_five_minutes(), half_an_hour()]))
-    note = GAIN_NOTE.format(anchor=anchor, further=further)
+    note = GAIN_NOTE.format(anchor=anchor, gifts=gifts)
     parts = [HEAD, f"{gain()}\n", f"{picture(GAIN_CHART)}\n", note]
     parts += [
         f"{demo_table(demo)}\n",
@@ -312,7 +293,8 @@ def page() -> str:
 
 def measurements_page() -> str:
     """The whole of `docs/measurements.md`."""
-    parts = [MEASUREMENTS_HEAD, *chart_sections()]
+    parts = [MEASUREMENTS_HEAD, *comparison_section(comparisons((GAIN_CHART, GIFTS_CHART)))]
+    parts += chart_sections()
     demo = json.loads((RESULTS / "demo.json").read_text())
     made = demo["made"]
     note = f" {made['date']}, leco_plugin {made['version']} at {made['commit']}."
