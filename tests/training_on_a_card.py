@@ -1,0 +1,154 @@
+"""python training_on_a_card.py refusals|sampling|METHOD FOLDER, on a pretended card."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tiny_scene
+import torch
+import tyro
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.plugins.registry import discover_methods
+from pretended_card import CARD, pretended_card
+from small_hosts import NERFACTO, NGP, QUICK, RAYS, SWITCH_NERF, sizes
+from tiny_run import tiny_config
+
+from leco_plugin.conformance.scene import SLAB, crossing
+from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.gate import GateConfig
+from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+
+HOSTS = {
+    "leco-ngp": [
+        *sizes(NGP, "pipeline.model.host"),
+        "--pipeline.target-num-samples=1024",
+        "--pipeline.max-num-samples-per-ray=16",
+    ],
+    "leco-nerfacto": [*sizes(NERFACTO, "pipeline.model.host"), *RAYS],
+    "leco-switch-nerf": [*sizes(SWITCH_NERF, "pipeline.model.host"), *RAYS],
+}
+LEARNING = [
+    "schedule.learn-steps=10",
+    "calibration.rays=64",
+    "calibration.recheck-rays=32",
+    "calibration.steps-per-recheck=4",
+]
+
+
+def refusals() -> None:
+    """What a card refuses."""
+    there, here = torch.ones(3, device=CARD), torch.ones(3)
+    of_cpu, mixtures = torch.Generator(), list[Callable[[], Any]]()
+    mixtures += [lambda: there + here, lambda: torch.stack([there, here]), there.numpy]
+    mixtures += [lambda: here[there > 0.0], lambda: there.index_select(0, here.long())]
+    mixtures += [lambda: torch.rand(3, device=CARD, generator=of_cpu)]
+    for mixture in mixtures:
+        with pytest.raises((RuntimeError, TypeError)):
+            mixture()
+        print("refused")
+    assert (there.cpu() + here).tolist() == [2.0] * 3 and there[here > 0.0].device == there.device
+
+
+def sampling() -> None:
+    """A frozen gate asked on the card, and what it keeps of rays there."""
+    rays = crossing()
+    placed, gate = rays.to(torch.device(CARD)), SLAB.occupancy()
+
+    def kept(estimator: LearnedOccupancyEstimator, where: Any, **options: Any) -> Any:
+        along = {"t_min": where.t_min, "t_max": where.t_max, "render_step_size": 0.05}
+        return estimator.sampling(where.origins, where.directions, **along, **options)
+
+    asked = {"sigma_fn": lambda t_starts, t_ends, ray_indices: torch.ones_like(t_starts)}
+    for options in ({}, {"cone_angle": 0.01}, asked):
+        ours = kept(LearnedOccupancyEstimator(gate).to(CARD), placed, **options)
+        theirs = kept(LearnedOccupancyEstimator(gate.to("cpu")), rays, **options)
+        assert all(part.device == torch.device(CARD) for part in ours)
+        same = all(torch.equal(one.cpu(), other) for one, other in zip(ours, theirs))
+        print("same" if same else "other samples")
+    positions = placed.at(torch.zeros(9, dtype=torch.long, device=CARD), placed.t_max[:9])
+    print("same" if gate.to(CARD).occupied(positions).device == positions.device else "elsewhere")
+
+
+def trainer_of(config: Any, scene: Path) -> Any:
+    """A trainer on the card, set up."""
+    config.data = config.pipeline.datamanager.data = scene
+    config.machine.device_type, config.mixed_precision = CARD.split(":")[0], False
+    config.save_config()
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    return trainer
+
+
+def render(trainer: Any) -> None:
+    """A whole test photograph."""
+    trainer.pipeline.eval()
+    camera, batch = trainer.pipeline.datamanager.next_eval_image(0)
+    with torch.no_grad():
+        outputs = trainer.pipeline.model.get_outputs_for_camera(camera)
+        trainer.pipeline.model.get_image_metrics_and_images(outputs, batch)
+    assert outputs["rgb"].device == torch.device(CARD)
+
+
+def leco_occupancy(folder: Path) -> None:
+    """The method's whole life: learned, frozen, sharpened, killed, resumed and rendered."""
+    scene = tiny_scene.write(folder / "scene")
+
+    def configured(**changes: Any) -> Any:
+        config = tiny_config(scene, folder / "runs", 16)
+        model = config.pipeline.model
+        gate = GateConfig(EncodingConfig(octaves=2), width=8, layers=1, scene_experts=2)
+        model.sizes = replace(model.sizes, gate=gate)
+        model.schedule = replace(model.schedule, learn_steps=10)
+        rays = {"rays": 64, "camera_rays": 16, "recheck_rays": 32, "steps_per_recheck": 4}
+        model.calibration = replace(model.calibration, **rays)
+        model.sharpening = replace(model.sharpening, steps=3, least_steps=4, rays=64)
+        config.max_num_iterations = 30
+        for name, value in changes.items():
+            setattr(config, name, value)
+        return config
+
+    trainer = trainer_of(configured(steps_per_save=20), scene)
+    trainer.train()
+    assert trainer.pipeline.model.progress.sharpened_at > 0, "it was not sharpened"
+    saved = trainer.checkpoint_dir
+    resumed = trainer_of(configured(load_dir=saved, timestamp="resumed"), scene)
+    assert bool(resumed.pipeline.model.mixture.frozen), "it was not frozen"
+    render(resumed)
+    print(f"frozen, sharpened, resumed and rendered on {CARD}")
+
+
+def guided(name: str, folder: Path) -> None:
+    """A host that learns its occupancy first."""
+    scene, learning = tiny_scene.write(folder / "scene"), "pipeline.model.occupancy.learning"
+    flags = [*HOSTS[name], *QUICK, *sizes(LEARNING, learning), "--max-num-iterations=12"]
+    config: Any = tyro.cli(
+        tyro.conf.FlagConversionOff[TrainerConfig],
+        default=discover_methods()[0][name],
+        args=[*flags, "--pipeline.model.occupancy.rays=64"],
+    )
+    config.output_dir = folder / "runs"
+    trainer = trainer_of(config, scene)
+    trainer.train()
+    render(trainer)
+    print(f"guided and rendered on {CARD}")
+
+
+def main() -> None:
+    """What the first argument names."""
+    what, *folder = sys.argv[1:]
+    with pretended_card():
+        if not folder:
+            {"refusals": refusals, "sampling": sampling}[what]()
+        elif what == "leco-occupancy":
+            leco_occupancy(Path(folder[0]))
+        else:
+            guided(what, Path(folder[0]))
+
+
+if __name__ == "__main__":
+    main()
