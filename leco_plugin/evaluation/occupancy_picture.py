@@ -200,19 +200,19 @@ def differing_heights(
     occupancy: Occupancy, box: ViewBox, low: float, high: float
 ) -> tuple[float, float]:
     """Two heights between `low` and `high`, scene units, in whose layers most decisions differ;
-    those of `HORIZONTAL` where fewer than two layers both keep and skip."""
+    those of `HORIZONTAL` where no two layers differ that both keep and skip."""
     heights = torch.linspace(low, high, LAYERS)
     x, y = (box.axis(a, count) for a, count in enumerate(box.cells(LAYER_CELLS)[:2]))
     positions = torch.stack(torch.meshgrid(heights, x, y, indexing="ij"), dim=-1)[..., [1, 2, 0]]
     kept = (query(occupancy, positions) >= occupancy.threshold).flatten(1).float()
     shares = kept.mean(dim=1)
     mixed = ((shares > 0.005) & (shares < 0.995)).nonzero()[:, 0]
-    if len(mixed) < 2:
-        lower, upper = (low + share * (high - low) for share in HORIZONTAL)
-        return lower, upper
     layers = kept[mixed]
     both = layers @ layers.T
     differing = both.diagonal()[:, None] + both.diagonal() - 2.0 * both
+    if not bool(differing.any()):
+        lower, upper = (low + share * (high - low) for share in HORIZONTAL)
+        return lower, upper
     pair = divmod(int(differing.argmax()), len(mixed))
     lower, upper = sorted(float(heights[mixed[number]]) for number in pair)
     return lower, upper

@@ -13,8 +13,20 @@ import torch
 from ball_occupancy import CENTRE, HALF, RADIUS, ball
 from PIL import Image
 
-from leco_plugin.evaluation.inspection import ViewBox, cameras_of, describe, exposed, whole_box
+from leco_plugin.evaluation.inspection import (
+    KEPT,
+    SKIPPED,
+    UNSEEN,
+    ViewBox,
+    cameras_of,
+    describe,
+    exposed,
+    ray_states,
+    whole_box,
+)
 from leco_plugin.evaluation.occupancy_picture import (
+    HORIZONTAL,
+    differing_heights,
     draw,
     headline,
     heights_seen_from_above,
@@ -74,6 +86,12 @@ def test_points_are_on_the_surface_and_face_outwards() -> None:
     assert float((normals * outwards).sum(dim=-1).mean()) > 0.9
 
 
+def test_points_of_a_picture_begin_two_cells_below_the_ground() -> None:
+    ground, cell = 0.5, 4.0 / 128
+    points, _ = surface_points(ball(), whole_box(ball()), ground)
+    assert ground - 2.0 * cell <= float(points[:, 2].min()) < ground - cell
+
+
 @pytest.mark.parametrize(
     ("kept", "seen"),
     [
@@ -92,6 +110,33 @@ def test_heights_are_those_of_what_is_met_from_above(kept: Any, seen: tuple[floa
     )
     box = ViewBox(torch.zeros(3), torch.full((3,), 4.0))
     assert heights_seen_from_above(known, box) == pytest.approx(seen, abs=0.05)
+
+
+def test_slices_are_drawn_where_most_decisions_differ() -> None:
+    """Below z = 1 a tenth of each layer is kept, above z = 2 nine tenths, and half between."""
+
+    def kept(at: torch.Tensor) -> torch.Tensor:
+        _, y, z = at.unbind(dim=-1)
+        return y < torch.where(z < 1.0, 0.4, torch.where(z < 2.0, 2.0, 3.6))
+
+    known: Any = SimpleNamespace(
+        threshold=0.5, threshold_value=torch.tensor(0.5), query=lambda at: kept(at).float()
+    )
+    box = ViewBox(torch.zeros(3), torch.tensor([2.0, 4.0, 3.0]))
+    lower, upper = differing_heights(known, box, 0.0, 3.0)
+    assert 0.0 <= lower < 1.0 and 2.0 <= upper <= 3.0
+    of_a_history = tuple(4.0 + 2.0 * share for share in HORIZONTAL)
+    assert differing_heights(known, box, 4.0, 6.0) == pytest.approx(of_a_history)
+
+
+def test_a_ray_that_meets_what_is_kept_says_so_whatever_lies_behind() -> None:
+    known = ball()
+    half_seen = Occupancy(known.gate, known.space, 0.5, report=known.report).eval()
+    half_seen.seen.cells[:, 32:] = False  # beyond the middle in y
+    shifts = torch.tensor([[0.0, -3.0, 0.0], [-3.0, 1.7, 0.0], [-3.0, -1.7, 0.0]])
+    directions = torch.tensor([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    states = ray_states(half_seen, torch.tensor(CENTRE) + shifts, directions)
+    assert states.tolist() == [KEPT, UNSEEN, SKIPPED]
 
 
 @pytest.mark.parametrize("threshold", [0.0, 1.0])
