@@ -107,3 +107,16 @@ def test_drawing_pixels_is_part_of_the_time_spent(monkeypatch: pytest.MonkeyPatc
     for spent in (5.5, 6.0):  # the second time of the same pixels
         psnr._measure(held_out_psnr.RAYS)
         assert psnr.spent == pytest.approx(spent) and psnr.cost == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(("spent", "rays"), [(10.0, 5120), (0.0, 8192), (19.9, 1024)])
+def test_the_last_look_is_at_as_many_pixels_as_time_is_left_for(
+    spent: float, rays: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 2,000 s a hundredth may be spent, and 256 pixels take half a second."""
+    clock, psnr = Clock(), HeldOutPsnr(None, None)
+    psnr.began, psnr.spent, psnr.cost, clock.now = 0.0, spent, 0.5, 2000.0
+    psnr.__dict__["has_pixels"] = True
+    monkeypatch.setattr(held_out_psnr, "time", clock)
+    monkeypatch.setattr(psnr, "_measure", lambda count: count)
+    assert psnr.look_last() == rays

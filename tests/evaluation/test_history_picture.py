@@ -16,7 +16,7 @@ from leco_plugin.chart.theme import LIGHT
 from leco_plugin.cli import main
 from leco_plugin.evaluation import history_picture
 from leco_plugin.evaluation.history_picture import spread_evenly
-from leco_plugin.learning.history import GateHistory
+from leco_plugin.learning.history import FILE_NAME, GateHistory
 
 
 @pytest.fixture
@@ -93,6 +93,13 @@ def test_a_long_history_is_shown_evenly(run: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(history_picture, "MOST_FRAMES", 2)
     with Image.open(history_picture.draw_history(ball(), run, run / "short.gif")) as film:
         assert film.n_frames == 2
+
+
+def test_lines_of_a_film_end_at_its_look(run: Path) -> None:
+    film = history_picture._Film(ball(), GateHistory.load(run / FILE_NAME, ball().gate))
+    for look, figure in enumerate(film.moving([0, 1, 2])):
+        for axes in figure.axes[2:]:
+            assert [list(line.get_xdata()) for line in axes.lines] == [[0, 10, 20][: look + 1]] * 3
 
 
 def test_a_still_picture_is_drawn_too(run: Path) -> None:

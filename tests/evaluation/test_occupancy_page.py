@@ -13,7 +13,7 @@ from browser import needs_chromium, text_of_what_asks_nobody
 from page_text import figure_text
 
 from leco_plugin.evaluation.inspection import SceneColours, ViewBox, whole_box
-from leco_plugin.evaluation.occupancy_page import faces_of, write_page
+from leco_plugin.evaluation.occupancy_page import _mesh, faces_of, write_page
 from leco_plugin.evaluation.occupancy_picture import seen_from_above
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.coloured_points import PointCloud
@@ -47,6 +47,19 @@ def test_faces_lie_between_cells_inside_and_outside() -> None:
     assert sides[0] == (1.0, 1.5, 1.5) and sides[-1] == (2.0, 1.5, 1.5) and len(set(sides)) == 6
     assert len(faces_of(~inside, box, beyond=True)) == 6
     assert len(faces_of(~inside, box, beyond=False)) == 6 + 6 * 9
+
+
+def test_two_triangles_cover_each_face() -> None:
+    faces = faces_of(torch.ones(2, 1, 1).bool(), ViewBox(torch.zeros(3), torch.ones(3)), False)
+    mesh = _mesh(faces)
+    places = torch.stack([torch.from_numpy(mesh[axis]) for axis in "xyz"], dim=-1)
+    numbers = torch.stack([torch.from_numpy(mesh[corner]).long() for corner in "ijk"], dim=-1)
+    triangles = places[numbers].view(len(faces), 2, 3, 3)
+    torch.testing.assert_close(triangles.mean(dim=(1, 2)), faces.mean(dim=1))
+    first, second = triangles.diff(dim=2).unbind(dim=2)
+    areas = torch.linalg.cross(first, second).norm(dim=-1).sum(dim=1) / 2
+    sides = (faces[:, 1:3] - faces[:, :2]).norm(dim=-1)
+    torch.testing.assert_close(areas, sides.prod(dim=1))
 
 
 def test_a_page_is_one_small_file_with_what_is_kept_the_cameras_and_the_bounds(page: Path) -> None:

@@ -29,6 +29,7 @@ from leco_plugin.evaluation.timed_run import (
     set_up,
     timed_run,
 )
+from leco_plugin.learning.run import Progress
 from leco_plugin.scenes.input_error import InputError
 
 RATE = 0.01
@@ -286,10 +287,12 @@ class Run:
         self.model.field(torch.zeros(rays, 3))
         return [2.0 * 10.0 ** (-next(self.psnrs) / 10.0), 1e-13]
 
-    def record(self) -> TimedRun:
+    def record(
+        self, points: int = 2, seconds: float = 40.0, learn_seconds: float | None = None
+    ) -> TimedRun:
         config: Any = SimpleNamespace(method_name="method")
-        budget = Budget(40.0)
-        return timed_run(config, budget, sampler="s", curve_points=2, images=0)[0]
+        budget = Budget(seconds, learn_seconds=learn_seconds)
+        return timed_run(config, budget, sampler="s", curve_points=points, images=0)[0]
 
 
 @pytest.fixture
@@ -318,6 +321,21 @@ def test_learning_counts_as_time_and_looks_do_not(a_run: Callable[..., Run], tim
     assert record.psnr == psnrs[-1]
     assert record.image_psnr == pytest.approx((18.0 - 10.0 * math.log10(2.0) + 120.0) / 2)
     assert record.train_queries["field"] == 6 * 5
+
+
+def test_looks_are_evenly_spaced_over_the_budget(a_run: Callable[..., Run]) -> None:
+    run = a_run(nn.Module(), *[4.0] * 10)
+    run.psnrs = iter([20.0] * 4)
+    assert [seconds for seconds, _ in run.record(points=4).curve] == [12.0, 20.0, 32.0, 40.0]
+
+
+@pytest.mark.parametrize(("allocator", "peak"), [(None, 5), (3, 3)])
+def test_the_peak_memory_is_the_allocators_where_there_is_one(
+    allocator: int | None, peak: int, a_run: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "peak_process_bytes", lambda: 5)
+    monkeypatch.setattr(module, "peak_allocator_bytes", lambda: allocator)
+    assert a_run(nn.Module(), 40.0).record().peak_memory_bytes == peak
 
 
 def test_points_of_a_curve_that_are_no_number_are_left_out() -> None:
@@ -376,6 +394,16 @@ def test_a_model_that_learns_itself_knows_its_last_step(
     assert record.steps == len(seconds)
     if ends is None:
         assert (record.freeze_seconds, record.step_seconds) == (36.0, 1.0)
+
+
+def test_a_model_that_learns_itself_keeps_to_its_learning_time(a_run: Callable[..., Run]) -> None:
+    """Of 100 s 45 are left after 15 steps. The first five, which compile, say nothing of others."""
+    model: Any = nn.Module()
+    model.progress = Progress(learn_steps=2000, configured=2000)
+    run, found = a_run(model, *[9.0] * 5, *[1.0] * 10, 145.0), []
+    run.ends = lambda step: found.append(model.progress.learn_steps)
+    run.record(seconds=200.0, learn_seconds=100.0)
+    assert found == [2000] * 15 + [15 + 45]
 
 
 def test_updates_of_a_grid_are_learning_time(a_run: Callable[..., Run], time: Time) -> None:

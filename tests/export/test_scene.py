@@ -17,6 +17,7 @@ from scene_files import change, described, refused
 from scipy.spatial.transform import Rotation
 
 from leco_plugin.chart.theme import new_figure, save_picture
+from leco_plugin.evaluation import inspection
 from leco_plugin.evaluation.occupancy_picture import draw
 from leco_plugin.export import export, export_folder, in_words
 from leco_plugin.occupancy import Occupancy
@@ -262,6 +263,16 @@ def test_another_scene_gives_no_colours_and_no_start_for_splats(
         with pytest.raises(ValueError, match="0 of the 3 cameras that the occupancy names are in"):
             export(file, format, tmp_path / out, 16, data=scene)
     assert not export(file, "ply", tmp_path / "k.ply", 16)["photograph_colours"]
+
+
+@pytest.mark.parametrize(("left", "is_known"), [(2, True), (1, False)])
+def test_a_scene_with_half_of_the_cameras_is_that_of_the_run(
+    left: int, is_known: bool, file: Path, scene: Path
+) -> None:
+    frames = described(scene)["frames"]
+    change(scene, lambda meta: meta.update(frames=frames[:left]))
+    with nullcontext() if is_known else refused("1 of the 3 cameras that the occupancy names"):
+        assert inspection.scene_of(Occupancy.load(file), file, scene) is not None
 
 
 def test_a_copy_says_what_its_scene_leaves_to_a_folder_beside_it(

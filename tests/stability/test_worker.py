@@ -233,15 +233,15 @@ class Painter:
 
 
 class Pictures:
-    """Grey held-out pictures, whose rays know their column."""
+    """Grey held-out pictures from the origin, whose rays know their column."""
 
-    def __init__(self, folder: Path, many: int) -> None:
+    def __init__(self, folder: Path, many: int, metres: float = math.inf) -> None:
         (folder / TRUTH).mkdir()
         self.image_filenames = [folder / "images" / f"{n}.png" for n in range(many)]
         facts = {
-            "depth": np.full((HEIGHT, WIDTH), np.inf, np.float32),
+            "depth": np.full((HEIGHT, WIDTH), metres, np.float32),
             "detail": np.arange(WIDTH)[None].repeat(HEIGHT, 0) < DETAIL,
-            "shown_by": np.zeros((HEIGHT, WIDTH), int),
+            "shown_by": np.full((HEIGHT, WIDTH), FEWEST_VIEWS * math.isfinite(metres)),
         }
         for file in self.image_filenames:
             np.savez(folder / TRUTH / f"{file.stem}.npz", **facts)
@@ -265,15 +265,23 @@ class Pictures:
         return {"image": torch.full((HEIGHT, WIDTH, 3), 0.5)}
 
 
-def test_errors_of_pictures_are_those_of_the_pixels_that_are_looked_at(tmp_path: Path) -> None:
-    manager = SimpleNamespace(
-        eval_dataset=Pictures(tmp_path, 2),
-        train_dataparser_outputs=SimpleNamespace(dataparser_scale=1.0),
-    )
-    pipeline = SimpleNamespace(
+def pipeline_of(pictures: Pictures, scale: float) -> Any:
+    """Of a host that keeps a shell around the origin; `scale` is scene units a metre."""
+    outputs = SimpleNamespace(dataparser_scale=scale)
+    manager = SimpleNamespace(eval_dataset=pictures, train_dataparser_outputs=outputs)
+    return SimpleNamespace(
         datamanager=manager, model=Painter(), device="cpu", eval=lambda: None, train=lambda: None
     )
-    found, shown = measure(pipeline, tmp_path, 64)
+
+
+@pytest.mark.parametrize(("metres", "lost"), [(4.0 * RADIUS, 0.0), (RADIUS, 1.0)])
+def test_surfaces_are_looked_for_in_scene_units(metres: float, lost: float, tmp_path: Path) -> None:
+    pipeline = pipeline_of(Pictures(tmp_path, 1, metres), scale=0.25)
+    assert measure(pipeline, tmp_path, 64)[0].lost_mass == lost
+
+
+def test_errors_of_pictures_are_those_of_the_pixels_that_are_looked_at(tmp_path: Path) -> None:
+    found, shown = measure(pipeline_of(Pictures(tmp_path, 2), scale=1.0), tmp_path, 64)
     third = DETAIL / WIDTH
     assert found.psnr == pytest.approx(-10 * math.log10(third * 0.09 + (1 - third) * 0.01))
     assert found.detail_psnr == pytest.approx(-10 * math.log10(0.09))
