@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 
 import pytest
@@ -28,6 +29,7 @@ from leco_plugin.learning.dense import (
     SURFACE_STEPS,
     DenseRendering,
     Reference,
+    evaluating,
     near_median_depth,
     near_surface,
     reference_of,
@@ -457,3 +459,12 @@ def test_only_lower_thresholds_are_tried_where_that_is_asked() -> None:
 def test_lower_than_a_threshold_that_was_kept_in_float32_is_the_next_one(number: int) -> None:
     kept = float(torch.tensor(THRESHOLDS[number], dtype=torch.float32))
     assert thresholds_below(kept) == list(THRESHOLDS[number + 1 :])
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_a_model_is_left_in_the_mode_that_it_was_in(training: bool) -> None:
+    model = torch.nn.Sequential(torch.nn.Dropout()).train(training)
+    with suppress(ValueError), evaluating(model):
+        assert not model[0].training
+        raise ValueError
+    assert model.training == model[0].training == training

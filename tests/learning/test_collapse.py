@@ -103,12 +103,15 @@ def test_a_form_that_was_given_up_stays_given_up() -> None:
     assert kept_to.imbalance == 4.0 * PAPER.imbalance  # what its own recoveries have earned
 
 
-def test_points_of_one_expert_are_shared_out_and_the_balance_counts_more() -> None:
+@pytest.mark.parametrize(("step", "learn_to"), [(150, 201), (120, 200)])
+def test_points_of_one_expert_are_shared_out_and_the_balance_counts_more(
+    step: int, learn_to: int
+) -> None:
     progress, head = Progress(learn_steps=200, configured=200), head_of([0.0, 30.0, 0.0])
-    healed("one expert", progress, 150, shares=ONE, head=head)
+    healed("one expert", progress, step, shares=ONE, head=head)
     assert (head.bias[1] - head.bias[2]).abs() < 1e-6
-    assert progress.learn_steps == 201 and not is_dense(progress, 151)
-    assert annealed(LOSSES, progress, 151).balance == EASED * LOSSES.balance
+    assert progress.learn_steps == learn_to and not is_dense(progress, step + 1)
+    assert annealed(LOSSES, progress, step + 1).balance == EASED * LOSSES.balance
     assert not is_restart_due(Collapse("a cause", "empty"), LOSSES, progress)  # no new last layer
 
 

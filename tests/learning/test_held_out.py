@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
@@ -14,8 +15,9 @@ from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from small_learner import SMALLEST, NoPixels, small_mixture
 
 from leco_plugin.learning.calibration import CalibrationConfig
-from leco_plugin.learning.dense import dense_rendering, evaluating
+from leco_plugin.learning.dense import dense_reference, dense_rendering, evaluating
 from leco_plugin.learning.held_out import HeldOut
+from leco_plugin.learning.quality import FIELD, ONE_COLOUR
 from leco_plugin.learning.sharpening import SharpeningConfig
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.scenes import learning_data
@@ -122,6 +124,21 @@ def test_prices_are_measured_in_the_appearance_of_each_image() -> None:
         of_the_mean = mixture.shade(unknown, intervals).rgb
     torch.testing.assert_close(of_the_mean[0], of_the_mean[1], atol=1e-6, rtol=0.0)
     assert float((reference.rgb[0] - reference.rgb[1]).abs().max()) > 0.05
+
+
+def test_a_report_has_the_psnr_of_the_field_and_of_one_colour_on_the_rays_of_calibration() -> None:
+    torch.manual_seed(0)
+    mixture, truth, data = small_mixture(), torch.rand(9, 3), NoPixels()
+    rays = mixture.rays(data.survey.origins, data.survey.directions, None)
+    data.held_out = lambda *_: (rays, truth)  # type: ignore[method-assign]
+    config = CalibrationConfig(rays_at_once=4)
+    _, report = HeldOut(mixture, data, config, restarted=False).price()  # type: ignore[arg-type]
+    with evaluating(mixture), torch.no_grad():
+        shown = dense_reference(mixture, rays).rgb
+    for name, colours in ((FIELD, shown.clamp(0.0, 1.0)), (ONE_COLOUR, truth.mean(dim=0))):
+        error = float((colours - truth).square().mean())
+        assert report[name] == pytest.approx(-10.0 * math.log10(error), abs=1e-3)
+    assert report["calibration_rays"] == 9
 
 
 def test_photographs_that_vouch_do_not_teach_the_small_gate_either() -> None:

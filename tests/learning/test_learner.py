@@ -81,6 +81,26 @@ def test_a_short_run_says_once_that_half_is_learning(printed: Any) -> None:
     assert printed() == ""
 
 
+def test_a_resumed_run_of_another_schedule_learns_for_half_of_the_steps_that_are_left() -> None:
+    progress, longer = Progress(learn_steps=50, configured=50), ScheduleConfig(learn_steps=500)
+    small_learner(ARun(start=100, end=300), progress=progress, schedule=longer).begin()
+    assert progress.learn_steps == 100 + 100
+
+
+def test_a_resumed_run_has_the_earlier_history_in_its_own_folder(
+    learner: Learner, tmp_path: Path
+) -> None:
+    before, after = tmp_path / "before", tmp_path / "after"
+    (before / "checkpoints").mkdir(parents=True)
+    after.mkdir()
+    learner.run.folder = before
+    learner._record(3)
+    run = ARun(start=4)
+    run.folder, run.resumed_from = after, before / "checkpoints"
+    small_learner(run).begin()
+    assert GateHistory.load(after / history.FILE_NAME, learner.mixture.gate).steps == [3]
+
+
 def test_learning_on_takes_a_quarter_more_and_is_said(
     learner: Learner, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -45,18 +45,23 @@ def test_the_seed_decides_the_gate_and_other_dice_are_left_alone() -> None:
     assert not torch.equal(*begun)
 
 
-def test_the_rate_falls_by_a_half_cosine_to_a_twentieth(monkeypatch: pytest.MonkeyPatch) -> None:
-    rates: list[float] = []
+@pytest.mark.parametrize(("kind", "first"), [("frequency", [0.01]), ("hash", [0.01, 0.02])])
+def test_rates_fall_by_a_half_cosine_to_a_twentieth(
+    kind: str, first: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Tables have twice the rate of networks."""
+    rates: list[list[float]] = []
 
     class Adam(torch.optim.Adam):
         def step(self, *_: Any) -> None:
-            rates.append(self.param_groups[0]["lr"])
+            rates.append([group["lr"] for group in self.param_groups])
 
     monkeypatch.setattr(torch.optim, "Adam", Adam)
-    teach(GateConfig(EncodingConfig(octaves=2), 8, 1, 1), ball_lesson(10), 4, "float32")
+    teach(GateConfig(ENCODINGS[kind], 8, 1, 1), ball_lesson(10), 4, "float32")
     cosines = [1.0, 0.5**0.5, 0.0, -(0.5**0.5)]
     expected = [0.05 + 0.95 * 0.5 * (1.0 + cosine) for cosine in cosines]
-    assert rates == pytest.approx([0.01 * share for share in expected])
+    for share, found in zip(expected, rates, strict=True):
+        assert found == pytest.approx([share * rate for rate in first])
 
 
 def test_rounded_weights_are_held_by_bfloat16() -> None:

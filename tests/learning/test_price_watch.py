@@ -12,7 +12,7 @@ import pytest
 import torch
 from small_learner import ARun, NoPixels, small_learner, small_mixture
 
-from leco_plugin.learning import held_out
+from leco_plugin.learning import held_out, price_watch
 from leco_plugin.learning.calibration import CalibrationConfig, Measured, RayPrices
 from leco_plugin.learning.collapse import GateCollapsed
 from leco_plugin.learning.dense import DenseRendering, Reference
@@ -78,6 +78,34 @@ def test_measuring_again_keeps_to_its_share_of_the_time() -> None:
         steps = steps_until_next(CONFIG, seconds, a_step)
         assert steps >= CONFIG.steps_per_recheck
         assert seconds <= SHARE_OF_TIME * steps * max(a_step, 1e-9) * 1.0001
+
+
+def test_the_share_is_of_the_time_of_all_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten steps take 2 s on average, and the last one, which saves, 11 s. Measuring takes 20 s."""
+    times = iter((0.0, 20.0))
+    monkeypatch.setattr(price_watch, "seconds_now", lambda: next(times))
+    source: Any = SimpleNamespace(prepare=lambda: None, excesses=lambda _: {}, count_rays=float)
+    state = WatchState(due=9)
+    watch = PriceWatch(state, source, CONFIG, torch.device("cpu"))
+    for step in range(10):
+        watch.after_step(step, 1.0 if step < 9 else 11.0, 1.0, skips=True)
+    assert state.due == 9 + 20.0 / (SHARE_OF_TIME * 2.0)
+
+
+def test_endless_new_rays_count_until_they_are_forgotten() -> None:
+    rays, asked = torch.zeros(CONFIG.recheck_rays), []
+
+    def count_rays(limit: int) -> float:
+        asked.append(limit)
+        return float(limit)
+
+    source: Any = SimpleNamespace(excesses=lambda _: {"a price": rays}, count_rays=count_rays)
+    source.prepare = lambda: None
+    watch = PriceWatch(WatchState(due=1), source, CONFIG, torch.device("cpu"))
+    for step in range(1, 5002, 100):
+        watch.after_step(step, 1.0, 1.0, skips=True)
+    sums = [*watch.state.evidence.values()]
+    assert len(asked) > 40 and Evidence(*sums[0]).rays == pytest.approx(5.0 * len(rays), rel=1e-3)
 
 
 REPORT = {"threshold": 0.4, "empty_fraction": 0.7, "params": 5}

@@ -36,6 +36,13 @@ def test_a_learning_phase_is_counted_from_where_it_began() -> None:
     assert Progress(began=301, healed_at=4990).since == 4991
 
 
+def test_what_is_shaded_is_a_mean_over_some_ten_batches() -> None:
+    progress = Progress()
+    for share, mean in ((0.5, 0.95), (0.05, 0.86)):
+        progress.has_shaded(share)
+        assert progress.learning_kept == pytest.approx(mean)
+
+
 def test_progress_is_read_back_without_unsafe_loading() -> None:
     watch = WatchState(800, 4, {"a price": (1.0, 2.0, 3.0)}, 7, 0.25)
     progress = Progress(

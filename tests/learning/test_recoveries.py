@@ -239,6 +239,7 @@ def test_without_steps_to_heal_a_gate_is_frozen_as_it_is(kind: str, healthy_run)
     list(steps_of(run, 200))
     assert run.frozen == [199] and run.progress.recoveries == 0
     assert torch.equal(run.mixture.gate.head.weight, before)
+    assert not run.progress.looks_collapsed, "else nothing would be saved"
 
 
 @pytest.mark.parametrize(("looks", "steps"), [(OCCUPIED, 1900), (ONE_EXPERT, 1650)])

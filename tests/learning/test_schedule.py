@@ -7,12 +7,14 @@ from itertools import pairwise
 import pytest
 import torch
 
+from leco_plugin.learning.run import Progress
 from leco_plugin.learning.schedule import (
     ScheduleConfig,
     converged,
     decisions_agree,
     is_unsettled,
     ramp,
+    schedule_since,
 )
 
 SCHEDULE = ScheduleConfig(learn_steps=1000, earliest=0.5, ramp_from=0.2, ramp_to=0.6)
@@ -27,6 +29,12 @@ def test_the_ramp_rises_from_zero_to_one_between_its_ends() -> None:
 def test_a_ramp_that_would_end_before_it_begins_is_refused() -> None:
     with pytest.raises(ValueError, match=r"ramp-from is 0\.8.*at most ramp-to, 0\.7"):
         ScheduleConfig(ramp_from=0.8)
+
+
+def test_a_gate_that_begins_anew_has_the_schedule_of_the_steps_from_there() -> None:
+    first, anew = (Progress(learn_steps=began + 600, began=began) for began in (0, 2000))
+    assert schedule_since(SCHEDULE, anew) == schedule_since(SCHEDULE, first)
+    assert schedule_since(SCHEDULE, anew).learn_steps == 600
 
 
 @pytest.mark.parametrize("learn_steps", [1, 2, 10])

@@ -204,6 +204,7 @@ def test_it_is_sharpened_at_the_end_of_a_run_that_pays_for_it(
     mixture = a_mixture()
     learner = at_the_end(mixture, end, steps=100, rays=200)
     learner.run.folder, last = tmp_path, end - 2
+    learner.watch.state.evidence = {"the image price": (9.0, 9.0, 9.0)}
     learner.after_step(last - 1, 0.1, 5.0)
     assert mixture.small is None
     learner.after_step(last, 0.1, 5.0)
@@ -212,6 +213,7 @@ def test_it_is_sharpened_at_the_end_of_a_run_that_pays_for_it(
     assert learner.run.saved == ([last] if sharpened else [])
     soon = last + NEVER_AGAIN.steps_per_recheck
     assert learner.watch.state.due == (soon if sharpened else 0), "its price is measured soon"
+    assert (learner.watch.state.evidence == {}) == sharpened, "it was of the large gate"
     if not sharpened:
         return
     said = printed().split("taught in")[1]
@@ -276,6 +278,16 @@ def test_prices_of_guided_sharpening_are_sums_of_costs() -> None:
     assert report["image_price_db"] == 0.03 and report["price_error_db"] == pytest.approx(0.005)
     assert report["lost_surface_mass"] == pytest.approx(3e-4)
     assert report["surface_error"] == pytest.approx(5e-5)
+
+
+def test_a_second_small_gate_leaves_in_the_report_what_the_large_one_did() -> None:
+    frozen, then, now = (Measured(0.5 - skip, 1e-4, 1e-4, 0.01, skip) for skip in (0.1, 0.2, 0.3))
+    report: dict[str, Any] = {"params": 7, **frozen._asdict()}
+    for measured, before in ((then, frozen), (now, then)):
+        report = Sharpened(Gate(GATE), measured, before, None).report(report, SMALLEST.gate)
+    learned = report["learned"]
+    assert (learned["threshold"], learned["empty_fraction"], learned["params"]) == (0.4, 0.1, 7)
+    assert (report["threshold"], report["empty_fraction"]) == (now.threshold, now.empty_fraction)
 
 
 def test_the_log_names_the_costs_of_both_gates_and_what_does_not_pay() -> None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
+from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.pixel_samplers import PixelSamplerConfig
+from small_learner import small_mixture
 
 from leco_plugin.learning.calibration import CalibrationConfig, Measured
 from leco_plugin.learning.quality import price_in_words, views_in_words
@@ -50,6 +53,23 @@ def test_nothing_is_drawn_of_them_until_all_train(data: LearningData) -> None:
     data.prepare_batch(40.0, distances=False)
     drawn = sampler.sample(dict(data.manager.images))["indices"][:, 0]
     assert {5, 15, 25, 35} <= set(drawn.tolist())
+
+
+def test_for_one_draw_of_rays_they_are_set_aside(
+    data: LearningData, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sampler = data.manager.train_pixel_sampler
+    aside: list[list[int]] = []
+
+    def bundles(_: Any, count: int) -> Iterator[RayBundle]:
+        aside.append(sampler.set_aside.nonzero()[:, 0].tolist())
+        images = torch.zeros(count + 1, 1, dtype=torch.int64)
+        ahead = torch.tensor([[1.0, 0.0, 0.0]]).expand(count + 1, 3)
+        yield RayBundle(torch.zeros(count + 1, 3), ahead, torch.ones(count + 1, 1), images)
+
+    monkeypatch.setattr(learning_data, "training_bundles", bundles)
+    assert len(data.training_rays(small_mixture(), 7, set_aside=4).origins) == 7
+    assert aside == [[5, 15, 25, 35]] and sampler.set_aside is None
 
 
 @pytest.mark.parametrize("images", [[torch.zeros(6, 7, 3)] * 40, torch.zeros(16, 6, 7, 3)])
