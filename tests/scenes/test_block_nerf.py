@@ -269,6 +269,23 @@ def test_records_of_another_folder_are_not_taken_for_those_that_were_read(
     assert make_scene(tmp_path / "other", tmp_path / "scene")["pictures"] == 1
 
 
+def test_a_file_that_another_of_its_size_replaces_is_read_anew(
+    records: Path, tmp_path: Path
+) -> None:
+    first, *_, last = sorted(records.iterdir())
+    other = write(tmp_path / "other", "train.tfrecord", Shot(known=9))
+    whole, content = last.read_bytes(), other.read_bytes()
+    first.write_bytes(first.read_bytes().ljust(1 << 19, b"\0"))  # gzip reads over such an end
+    last.write_bytes(b"")
+    with refused("no record"):
+        make_scene(records, tmp_path / "scene")
+    last.write_bytes(whole)
+    first.write_bytes(content.ljust(1 << 19, b"\0"))
+    assert make_scene(records, tmp_path / "scene")["pictures"] == 3
+    files = {frame["file_path"] for frame in described(tmp_path / "scene")["frames"]}
+    assert f"images/cam03_{9:016x}.png" in files
+
+
 def _mirrored() -> dict[str, bytes]:
     return {"ray_dirs": _floats(Shot().rays()[1] * [1.0, 1.0, -1.0])}
 

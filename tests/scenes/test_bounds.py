@@ -77,6 +77,15 @@ def test_bounds_are_of_all_points_but_one_in_a_thousand_at_either_end() -> None:
     torch.testing.assert_close(inner.center, ends.mean(dim=0))
 
 
+def test_a_ray_that_hardly_goes_down_widens_the_box_as_far_as_it_is_marched() -> None:
+    """It would meet the ground some 200 away."""
+    poses, directions, points = from_above()
+    directions[0, 0] = torch.nn.functional.normalize(torch.tensor([-1.0, 0.0, -0.06]), dim=0)
+    bounds = find_bounds(poses, directions, points)
+    left = float(bounds.center[0]) - bounds.half_extent
+    assert bounds.far < 40.0 and -6.0 - 1.1 * bounds.far < left < -6.0 - 0.9 * bounds.far
+
+
 def test_marched_samples_of_a_box_lie_in_its_space() -> None:
     poses, directions, points = from_above()
     bounds = find_bounds(poses, directions, points)

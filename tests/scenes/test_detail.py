@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from scene_files import refused
 from torch import Tensor
 
-from leco_plugin.scenes.bounds import BoundsConfig
+from leco_plugin.scenes.bounds import BoundsConfig, find_bounds
 from leco_plugin.scenes.survey import _pixel_density, covering_rays, detail_of
 
 HEIGHT, SIDE, FOCAL = 2.0, 32, 32.0
@@ -66,6 +68,17 @@ def test_the_footprint_of_a_pixel_is_exact_however_few_an_image_has() -> None:
     _, directions = covering_rays(cameras)
     pose = cameras.camera_to_worlds[0]
     assert float(_pixel_density(torch.zeros(1, 3), pose, directions[0], 8)) == pytest.approx(16.0)
+
+
+@pytest.mark.parametrize(("space", "halves"), [("box", 2), ("contraction", 4)])
+def test_a_contraction_is_twice_as_many_pixels_across_as_its_inner_cube(
+    space: Any, halves: int
+) -> None:
+    cameras, points, config = survey(6.0), ground(6.0), BoundsConfig(space)
+    _, directions = covering_rays(cameras)
+    half = find_bounds(cameras.camera_to_worlds, directions, points, config).half_extent
+    across = detail_of(cameras, points, config).across
+    assert across == pytest.approx(halves * half * 16.0, rel=0.02)
 
 
 def test_of_distances_the_nearest_counts() -> None:

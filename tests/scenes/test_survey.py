@@ -246,6 +246,16 @@ def test_darkness_and_nothing_raise_none(above: list[float]) -> None:
     assert "raised" not in bounds.reason and float(bounds.aabb[5]) < 3.0
 
 
+@pytest.mark.parametrize(("columns", "raised"), [(PIXELS // 2, True), (PIXELS // 4, False)])
+def test_half_a_percent_of_the_rays_raises_the_bounds(columns: int, raised: bool) -> None:
+    """A lamp over the horizon of one picture is met by eight of 1280 rays, or by four."""
+    data = tilted([0.0, 0.0, 0.0])
+    dark, lit = data.train_dataset.image, data.train_dataset.image.clone()
+    lit[:8, :columns] = 1.0
+    data.train_dataset.get_data = lambda number: {"image": lit if number == 0 else dark}
+    assert ("raised" in survey(data).bounds.reason) == raised
+
+
 def test_altitudes_by_hand_stay() -> None:
     data = tilted([0.6, 0.8, 1.0])
     bounds = survey(data, BoundsConfig(altitudes=(-1.0, 1.0))).bounds
