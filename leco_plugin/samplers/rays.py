@@ -200,7 +200,7 @@ def plan(rays: Rays, rule: March) -> tuple[Candidates, int, int]:
         last = (candidates.first + counts).amax()
         sizes = torch.stack([*counts.aminmax(), last])
         shortest, longest, highest = sizes.long().tolist()
-        check_longest(highest, len(counts), rule.step_size)
+        check_longest(highest, len(counts), candidates.rule.step_size)
     return candidates, shortest, longest
 
 
@@ -211,6 +211,7 @@ def number(rays: Rays, rule: March) -> Candidates:
     pixel of a batch must not end a training run.
     """
     check_rays(rays)
+    rule = March(*map(float, rule))  # kernels take the bits of a whole number for another
     step_size, cone_angle = rule
     if not (step_size > 0.0 and math.isfinite(step_size)):
         raise ValueError(f"step_size must be positive and finite, got {step_size}")

@@ -292,6 +292,17 @@ def test_a_march_that_cannot_be_is_refused_in_the_same_words_with_cells(
             )
 
 
+@pytest.mark.parametrize("number", [int, torch.tensor], ids=["whole", "tensor"])
+def test_a_step_may_be_a_whole_number_or_a_tensor(learned, number):
+    rays = camera_rays(200)
+    expected, given = (
+        learned.sampling(*rays, far_plane=200.0, render_step_size=step, cone_angle=cone)
+        for step, cone in ((1.0, 0.0), (number(1), number(0)))
+    )
+    assert len(expected[0]) > 10
+    assert all(map(torch.equal, given, expected))
+
+
 def test_what_is_no_occupancy_is_refused_in_a_line():
     with pytest.raises(TypeError, match=r"^Occupancy\.load\(FILE\) gives an .*; a str is none$"):
         LearnedOccupancyEstimator("box.safetensors")
