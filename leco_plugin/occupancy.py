@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from leco_plugin.models.frozen_gate import occupancy_of
 from leco_plugin.models.gate import Gate, GateConfig, check_sizes
+from leco_plugin.samplers.boxes import check_positions
 from leco_plugin.samplers.kernels import fused
 from leco_plugin.scenes.input_error import first_line
 from leco_plugin.scenes.whole_files import write_whole
@@ -130,7 +131,7 @@ class Occupancy(nn.Module):
         Raises:
             ValueError: positions are of another shape.
         """
-        _check_shape(positions)
+        check_positions(positions)
         # by coordinate: on a CPU rows of three numbers take five times as long
         columns = torch.stack(positions.to(self.space.center.dtype).unbind(-1))
         mapped = self.space.map(columns.T)
@@ -145,7 +146,7 @@ class Occupancy(nn.Module):
     def unseen(self, positions: Tensor) -> Tensor:
         """Whether scene positions [N, 3] lie in the space, but where no training ray crosses it:
         bool [N]; errors as of `query`."""
-        _check_shape(positions)
+        check_positions(positions)
         mapped = self.space.map(positions.to(self.space.center.dtype))
         inside = mapped.abs().amax(dim=-1) <= 1.0  # of NaN it is not
         return inside & ~self.seen(mapped.clamp(-1.0, 1.0).nan_to_num())
@@ -162,7 +163,7 @@ class Occupancy(nn.Module):
 
         On CUDA by the fused kernel where it runs, which may differ close to the threshold.
         """
-        _check_shape(positions)
+        check_positions(positions)
         decided = fused.decide(self, positions)
         return self.query(positions) >= self.threshold_value if decided is None else decided
 
@@ -273,11 +274,6 @@ class Occupancy(nn.Module):
         if cells is not None:
             occupancy.seen.cells.copy_(cells)
         return occupancy.requires_grad_(False).eval()
-
-
-def _check_shape(positions: Tensor) -> None:
-    if positions.dim() != 2 or positions.shape[-1] != 3:
-        raise ValueError(f"positions must be [N, 3], got {list(positions.shape)}")
 
 
 def _check_precision(path: Path, precision: str | None) -> None:

@@ -24,6 +24,14 @@ def checked_box(aabb: Sequence[float] | Tensor) -> Tensor:
     return box
 
 
+def check_positions(positions: Tensor) -> None:
+    """TypeError unless positions are a tensor, ValueError unless it is [N, 3]."""
+    if not isinstance(positions, Tensor):
+        raise TypeError(f"positions must be a tensor, got {type(positions).__name__}")
+    if positions.dim() != 2 or positions.shape[-1] != 3:
+        raise ValueError(f"positions must be [N, 3], got {list(positions.shape)}")
+
+
 def nested_boxes(box: Sequence[float] | Tensor, levels: int) -> list[Tensor]:
     """A box [6] and others around it, each twice as wide as the one before. ValueError if the box
     is empty or not finite, or there is not even one level."""

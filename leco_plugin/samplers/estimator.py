@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from leco_plugin.samplers.base import Estimator, Snapshot
-from leco_plugin.samplers.boxes import cell_centers, checked_box, intersect_box
+from leco_plugin.samplers.boxes import cell_centers, check_positions, checked_box, intersect_box
 from leco_plugin.samplers.cells.build import build_cache
 from leco_plugin.samplers.cells.cache import CellCache, OccupancyLike
 from leco_plugin.samplers.kernels import fused, native_march
@@ -156,6 +156,7 @@ class LearnedOccupancyEstimator(Estimator):
     def occupied(self, positions: Tensor) -> Tensor:
         """The gate's decision, from the cache where it is sure; positions [N, 3] to bool [N]."""
         self._refresh()
+        check_positions(positions)
         cache = self.cache
         if cache is None:
             return self.occupancy.occupied(positions)

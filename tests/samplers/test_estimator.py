@@ -303,6 +303,14 @@ def test_a_step_may_be_a_whole_number_or_a_tensor(learned, number):
     assert all(map(torch.equal, given, expected))
 
 
+def test_positions_that_do_not_fit_are_named(learned):
+    for asked in (learned, LearnedOccupancyEstimator(ball(), cache_bytes=0).occupancy):
+        with pytest.raises(ValueError, match=r"^positions must be \[N, 3\], got \[3\]$"):
+            asked.occupied(torch.zeros(3))
+        with pytest.raises(TypeError, match="must be a tensor, got list"):
+            asked.occupied([[0.0, 0.0, 0.0]])
+
+
 def test_what_is_no_occupancy_is_refused_in_a_line():
     with pytest.raises(TypeError, match=r"^Occupancy\.load\(FILE\) gives an .*; a str is none$"):
         LearnedOccupancyEstimator("box.safetensors")
