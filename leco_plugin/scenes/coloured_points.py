@@ -3,6 +3,7 @@ photographs that show them."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,6 +39,8 @@ CONFIG = "config.yml"
 NEAREST = 3
 """Points whose colours are averaged."""
 GREY = 128
+LONGEST_HEADER = 1 << 16
+"""Bytes of a .ply in which its number of points stands."""
 COLOURS = "points3D_rgb"
 """Key of their colours, uint8 [P, 3], beside `POINTS`. nerfstudio wants both or neither."""
 
@@ -111,15 +114,20 @@ def read_cloud(path: Path) -> PointCloud:
         # as a file and not by its name: nothing else is read that it may point to
         with path.open("rb") as file:
             loaded: Any = trimesh.load(file, file_type="ply", process=False)
+            file.seek(0)
+            named = re.search(rb"^element vertex (\d+)", file.read(LONGEST_HEADER), re.MULTILINE)
         is_empty = isinstance(loaded, trimesh.Scene) and not loaded.geometry
         vertices = () if is_empty else loaded.vertices
         positions = np.asarray(vertices, dtype=np.float64).reshape(-1, 3)
+        if named and len(positions) < int(named[1]):
+            raise ValueError(f"{len(positions)} of its {int(named[1])} points are there")
         is_mesh = getattr(getattr(loaded, "visual", None), "kind", None) == "vertex"
         paint = loaded.visual.vertex_colors if is_mesh else getattr(loaded, "colors", ())
         colours = np.asarray(paint, dtype=np.uint8)
     except Exception as error:  # noqa: BLE001  trimesh raises whatever its parsers meet
         why = one_line(error, 120)
-        raise InputError(f"{path} cannot be read as sparse points: {why}") from None
+        fault = f"{path} cannot be read as sparse points ({why})"
+        raise InputError(f"{fault}: put a whole .ply there, or remove what names it") from None
     sound = np.isfinite(positions).all(axis=1)
     if not len(colours) == len(positions) > 0:
         return PointCloud(positions[sound], np.zeros((0, 3), np.uint8))

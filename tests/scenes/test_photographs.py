@@ -260,6 +260,14 @@ def test_a_file_that_holds_no_points_is_named(scene: Path) -> None:
         read_points({"ply_file_path": "points.ply"}, scene)
 
 
+def test_a_file_that_is_cut_off_between_two_points_is_named(scene: Path) -> None:
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    head = f"ply\nformat ascii 1.0\nelement vertex 3\n{axes}end_header\n"
+    (scene / "cut.ply").write_text(head + "0 1 2\n" * 2)
+    with refused(r"cut\.ply cannot be read .* \(2 of its 3 points .* put a whole \.ply there"):
+        read_cloud(scene / "cut.ply")
+
+
 def test_a_scene_without_points_has_none_and_missing_ones_are_said(
     scene: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
