@@ -15,7 +15,7 @@ from leco_plugin.log import counted, say
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.region import SIDE, Region
 from leco_plugin.models.rendering import Rays
-from leco_plugin.scenes.bounds import BoundsConfig
+from leco_plugin.scenes.bounds import BoundsConfig, usable_points
 from leco_plugin.scenes.frames import data_frame_of, frame_of
 from leco_plugin.scenes.pixels.held_out_pixels import (
     HeldOutPixelSampler,
@@ -157,8 +157,10 @@ class LearningData:
             few = counted(len(dataset), "training photograph is", "training photographs are")
             few += " few: new views may fail"
             found.append(f"{few}; more, which overlap by two thirds, usually help")
-        if sparse_points(dataset) is None:
-            why = "this scene has no sparse points, so that its bounds are guessed from its cameras"
+        points = sparse_points(dataset)
+        if usable_points(points) is None:
+            lack = "no sparse points" if points is None else f"too few sparse points, {len(points)}"
+            why = f"this scene has {lack}, so that its bounds are guessed from its cameras"
             found.append(f"{why}; `leco points SCENE` finds some (it needs pycolmap)")
         return found
 

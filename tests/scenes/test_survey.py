@@ -17,6 +17,7 @@ from leco_plugin.scenes.city.cameras import CaptureConfig
 from leco_plugin.scenes.city.city import CityConfig
 from leco_plugin.scenes.city.folder import write_city
 from leco_plugin.scenes.frames import POINTS
+from leco_plugin.scenes.learning_data import LearningData
 from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 from leco_plugin.scenes.survey import (
@@ -142,6 +143,20 @@ def test_rays_that_miss_are_counted() -> None:
     data = datamanager(drone(), ground())
     shares = [survey(data, far=far).meeting for far in (9.0, 9.8, 20.0)]
     assert 0.0 < shares[0] < shares[1] < shares[2] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("count", "said"), [(None, "no sparse points,"), (31, "too few sparse points, 31,"), (32, "")]
+)
+def test_points_that_bound_nothing_are_told_with_what_finds_more(
+    count: int | None, said: str
+) -> None:
+    dataset: Any = type("Dataset", (list,), {})(range(20))
+    dataset.metadata = {} if count is None else {POINTS: cloud()[:count]}
+    data: Any = SimpleNamespace(manager=SimpleNamespace(train_dataset=dataset))
+    lines = LearningData.doubts(data)
+    assert len(lines) == bool(said)
+    assert all(f"this scene has {said} so that" in line for line in lines)
 
 
 def test_points_of_no_kind_are_none() -> None:
