@@ -10,6 +10,7 @@ from types import MappingProxyType
 from typing import Any
 
 import tyro
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.models.base_model import ModelConfig
@@ -50,9 +51,9 @@ def swapped_config(
 
     Raises:
         InputError: an occupancy is given, and seconds for learning one; there is no such method,
-            or it is guided or learns occupancy itself; there is no such sampler, or it asks another
-            kind of gate, or has no such option; there is no such file, or it is no occupancy; the
-            arguments name a config that would replace this one, or no scene.
+            or it is guided, learns occupancy itself or draws no rays; there is no such sampler, or
+            it asks another kind of gate, or has no such option; there is no such file, or it is no
+            occupancy; the arguments name a config that would replace this one, or no scene.
         SystemExit: the arguments are none of the method's; tyro has said why.
     """
     if file is not None and learn_seconds is not None:
@@ -74,6 +75,9 @@ def swapped_config(
             "--load-config would train what that file says, without a swap; a run that was swapped "
             "is trained again with ns-train and its config"
         )
+    if isinstance(getattr(config.pipeline, "datamanager", None), FullImageDatamanagerConfig):
+        lack = f"{method} draws whole images, not rays, and has no sampler that could be swapped"
+        raise InputError(f"{lack}: `leco export FILE` writes points to start splats from")
     if config.data is not None and not config.data.exists():
         raise InputError(f"there is no scene {config.data} (--data)")
     made = with_sampler_swapped(config, file, sampler, options, codes, other_scene)

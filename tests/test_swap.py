@@ -114,6 +114,10 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         {"method": "leco-ngp"},
         "ns-train leco-ngp --pipeline.model.occupancy.path .*occupancy.safetensors",
     ),
+    "a method that draws no rays": (
+        {"method": "splatfacto"},
+        "splatfacto draws whole images, not rays.*`leco export FILE` writes points",
+    ),
     "the method that learns": ({"method": "leco-occupancy"}, "is no host"),
     "an unknown sampler": ({"sampler": "learnt"}, "no sampler 'learnt'; there are"),
     "another kind of gate": ({"sampler": "learned-occupancy-hash"}, "asks a gate on hash"),
