@@ -30,14 +30,15 @@ Answer = tuple[RaySamples, list[Tensor], list[RaySamples]]
 
 class _ProposalSampler(nn.Module):
     """What a host of nerfstudio calls in place of its `ProposalNetworkSampler`, with sizes by name.
-    ValueError if there is not even one sample or candidate."""
+    ValueError where one is no positive whole number."""
 
     def __init__(self, initial_sampler: Sampler | None, single_jitter: bool, **sizes: int) -> None:
         super().__init__()
         for name, size in sizes.items():
-            if size < 1:
-                raise ValueError(f"a ray needs at least one sample, got {name} {size}")
-            setattr(self, name, size)
+            if size < 1 or size != int(size):
+                wanted = "a ray needs a positive whole number of samples"
+                raise ValueError(f"{wanted}, got {name} {size}")
+            setattr(self, name, int(size))  # numbers of a command line may be floats
         self.initial_sampler = initial_sampler or UniformLinDispPiecewiseSampler(
             single_jitter=single_jitter
         )
@@ -107,7 +108,7 @@ class LearnedOccupancySampler(_ProposalSampler):
             the same.
 
     Raises:
-        ValueError: there is not even one sample or candidate, or the frame is not [3, 4].
+        ValueError: samples or candidates are no positive whole number; the frame is not [3, 4].
     """
 
     frame: Tensor | None

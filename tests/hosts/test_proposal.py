@@ -170,12 +170,13 @@ def test_rays_without_bounds_are_refused(sampler):
 
 
 @pytest.mark.parametrize("name", ["num_samples", "num_candidates"])
-@pytest.mark.parametrize("size", [0, -1])
-def test_a_ray_without_a_sample_is_refused_in_a_line(name, size):
-    with pytest.raises(ValueError, match=f"at least one sample, got {name} {size}$"):
+@pytest.mark.parametrize("size", [0, -1, 3.5])
+def test_what_is_no_number_of_samples_is_refused_in_a_line(name, size):
+    with pytest.raises(ValueError, match=f"whole number of samples, got {name} {size}$"):
         LearnedOccupancySampler(Balls(), cache_bytes=0, **{name: size})
     with pytest.raises(ValueError, match=f"got samples {size}$"):
         DenseSampler(samples=size)
+    assert DenseSampler(samples=4.0).samples == 4
 
 
 def test_one_sample_and_one_candidate_are_enough():
