@@ -75,9 +75,6 @@ def swapped_config(
             "--load-config would train what that file says, without a swap; a run that was swapped "
             "is trained again with ns-train and its config"
         )
-    if isinstance(getattr(config.pipeline, "datamanager", None), FullImageDatamanagerConfig):
-        lack = f"{method} draws whole images, not rays, and has no sampler that could be swapped"
-        raise InputError(f"{lack}: `leco export FILE` writes points to start splats from")
     if config.data is not None and not config.data.exists():
         raise InputError(f"there is no scene {config.data} (--data)")
     made = with_sampler_swapped(config, file, sampler, options, codes, other_scene)
@@ -87,7 +84,7 @@ def swapped_config(
 
 def registered(method: str) -> TrainerConfig:
     """A copy of the config of a registered method, for the device that is there. InputError if
-    there is no such method, or its package is not installed."""
+    there is no such method, its package is not installed, or it draws no rays."""
     from nerfstudio.configs.method_configs import all_methods
 
     if method not in all_methods:
@@ -95,6 +92,9 @@ def registered(method: str) -> TrainerConfig:
     config = copy.deepcopy(all_methods[method])
     if not isinstance(config, TrainerConfig):
         raise InputError(f"{method!r} is known by name only: its package is not installed")
+    if isinstance(getattr(config.pipeline, "datamanager", None), FullImageDatamanagerConfig):
+        lack = f"{method} draws whole images, not rays, and has no sampler that could be swapped"
+        raise InputError(f"{lack}: `leco export FILE` writes points to start splats from")
     if config.machine.device_type == "cuda":
         config.machine.device_type = best_device()  # what nerfstudio's methods take for granted
     return config

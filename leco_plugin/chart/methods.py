@@ -147,9 +147,13 @@ def _samplers_of(method: str) -> tuple[list[str], str]:
 
 
 def _model_of(method: str) -> Any:
+    from nerfstudio.configs.method_configs import all_methods
+
     try:
         return registered(method).pipeline.model
     except InputError as error:
+        if method in all_methods:
+            raise
         raise InputError(f"{error}; and for charts {', '.join(VARIANTS)}") from None
 
 
