@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
@@ -25,7 +26,7 @@ from leco_plugin.log import counted, say, say_what_is_logged
 from leco_plugin.models.compute.ranks import is_first
 from leco_plugin.names import options_in
 from leco_plugin.samplers.kernels import VARIABLE, kernels_off
-from leco_plugin.scenes.input_error import InputError, TrainingStopped, first_line
+from leco_plugin.scenes.input_error import InputError, TrainingStopped, first_line, one_line
 from leco_plugin.studio.checkpoints import first_not_finite, previous_of, step_of, whole_of
 from leco_plugin.studio.run_folder import (
     check_photographs,
@@ -64,6 +65,19 @@ def catch_first_interrupt() -> Iterator[threading.Event]:
         yield asked
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def _trackers_in_one_line(vis: str) -> Iterator[None]:
+    """InputError for what wandb or comet raise where a run would begin to be logged there."""
+    try:
+        yield
+    except Exception as error:
+        calls = traceback.extract_tb(error.__traceback__)
+        if not any(call.name == "setup_event_writer" for call in calls):
+            raise
+        fault = f"--vis {vis} cannot begin ({one_line(error, 120)})"
+        raise InputError(f"{fault}: log in there, or give --vis tensorboard") from error
 
 
 class PrunedOptimizers(Optimizers):
@@ -126,7 +140,8 @@ class AtomicTrainer(Trainer):
         if config.logging.local_writer.enable:
             self.config = without_tables(config)
         try:
-            super().setup(*arguments, **options)
+            with _trackers_in_one_line(config.vis):
+                super().setup(*arguments, **options)
         finally:
             self.config = config
         if self._start_step >= end_of(self):

@@ -19,7 +19,11 @@ from leco_plugin.samplers.kernels import VARIABLE
 from leco_plugin.scenes.input_error import InputError, TrainingStopped
 from leco_plugin.studio import trainer as atomic_trainer
 from leco_plugin.studio.checkpoints import damage_of
-from leco_plugin.studio.trainer import AtomicTrainer, _say_which_kernels_are_off
+from leco_plugin.studio.trainer import (
+    AtomicTrainer,
+    _say_which_kernels_are_off,
+    _trackers_in_one_line,
+)
 
 
 @pytest.fixture
@@ -264,3 +268,16 @@ def test_kernels_that_are_off_are_said_before_training(
     monkeypatch.delenv(VARIABLE)
     _say_which_kernels_are_off()
     assert printed() == ""
+
+
+def test_a_tracker_that_cannot_begin_is_one_line_and_other_errors_stay() -> None:
+    def setup_event_writer() -> None:
+        raise ValueError("no key\nis there")
+
+    with (
+        pytest.raises(InputError, match=r"--vis wandb cannot begin \(no key is there\): log in"),
+        _trackers_in_one_line("wandb"),
+    ):
+        setup_event_writer()
+    with pytest.raises(ValueError, match="another"), _trackers_in_one_line("wandb"):
+        raise ValueError("another")
