@@ -366,6 +366,8 @@ def remedy_for(data: Path) -> str | None:
     for reader, folder in known:
         if command := command_with(reader, folder):
             return f"`{command}` reads it"
+    if known and known[0] == (READERS["transforms.json"], data.parent):
+        return f"give {data.parent}, which holds one"
     if known and "colmap" not in known[0][0]:
         return f"it is for the reader {known[0][0]}, and this command reads a transforms.json only"
     if (data / ASKED).is_file():

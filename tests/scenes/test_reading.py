@@ -331,7 +331,9 @@ def test_a_lens_that_nerfstudio_lacks_is_to_be_undistorted(scene: Path) -> None:
         read(as_colmap(scene, "FOV 32 32 32 32 16 16 0.1"))
 
 
-def test_a_folder_of_another_reader_names_it(scene: Path, tmp_path: Path) -> None:
+def test_a_folder_of_another_reader_names_it(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     as_colmap(scene)
     (scene / "transforms.json").unlink()
     command = f"`ns-train leco-occupancy --data {scene} colmap --colmap-path sparse/0` reads it"
@@ -362,6 +364,12 @@ def test_a_folder_of_another_reader_names_it(scene: Path, tmp_path: Path) -> Non
         (folder / name).write_text(begin)
         assert wanted in str(remedy_for(folder)), name
     assert remedy_for(tmp_path / "nowhere" / "at" / "all") is None
+    (tmp_path / "whole" / "images").mkdir(parents=True)
+    (tmp_path / "whole" / "transforms.json").write_text("{}")
+    monkeypatch.setattr("sys.argv", ["leco", "points"])
+    assert (
+        remedy_for(tmp_path / "whole" / "images") == f"give {tmp_path / 'whole'}, which holds one"
+    )
     (tmp_path / "begun" / "colmap").mkdir(parents=True)
     (tmp_path / "begun" / "images").mkdir()
     (tmp_path / "begun" / "colmap" / "asked.json").write_text("{}")
