@@ -155,7 +155,8 @@ def _remedy(error: BaseException, config: Any) -> str:
         command = f"`{command_with(reader, data) or reader}` takes them as they are"
         return f"it would make smaller copies of photographs of more than 1600 pixels: {command}"
     if "list of filenames for split" in str(error):
-        return "list photographs in val_filenames and test_filenames too, or remove train_filenames"
+        lists = "train_filenames, val_filenames and test_filenames"
+        return f"list photographs in each of {lists}, or remove these lists"
     if "camera model" in _reason(error).lower():
         return "undistort the photographs with `colmap image_undistorter`, and give that model"
     if re.search(r"\w\\{1,2}\w", str(error)):

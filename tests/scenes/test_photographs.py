@@ -320,9 +320,11 @@ def test_lists_that_leave_nothing_say_what_to_do(scene: Path) -> None:
         outputs_of(scene)
     meta = change(scene, lambda meta: meta.update(dict.fromkeys(LISTS)))
     some = [frame["file_path"] for frame in meta["frames"][:5]]
-    change(scene, lambda meta: meta.update(train_filenames=some))
-    with refused("list photographs in val_filenames and test_filenames too"):
-        outputs_of(scene, "val")
+    for given, lacks in (("train_filenames", "val"), ("test_filenames", "train")):
+        lists = dict.fromkeys(LISTS) | {given: some}
+        change(scene, lambda meta, lists=lists: meta.update(lists))
+        with refused("in each of train_filenames, val_filenames and test_filenames, or remove"):
+            outputs_of(scene, lacks)
 
 
 def test_only_cameras_that_look_down_are_above() -> None:
