@@ -34,6 +34,8 @@ class BoundsConfig:
 
 Span = tuple[float, float]
 """The lesser of two lengths, and the greater."""
+MOST_POINTS = 100_000
+"""Of which it is told whether a camera sees any."""
 FEWEST_POINTS = 32
 """Fewer sparse points say nothing of a scene."""
 OVER_CAMERAS = 0.06
@@ -231,17 +233,33 @@ def _quantiles(values: Tensor, share: float) -> Tensor:
 
 def _depths(poses: Tensor, directions: Tensor, points: Tensor) -> Tensor:
     """Distances from each camera to the sparse points in its field of view: [D]."""
-    points = points[torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:2000]]
+    depths = torch.cat(_depths_of_each(poses, directions, points, 2000))
+    if len(depths) == 0:
+        raise InputError("no camera sees a sparse point: the poses or the points are in other axes")
+    return depths
+
+
+def _depths_of_each(poses: Tensor, directions: Tensor, points: Tensor, most: int) -> list[Tensor]:
+    """The same of each camera, of up to `most` of the points."""
+    points = points[torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:most]]
     found = []
     for pose, rays in zip(poses, directions):
         ahead = -pose[:, 2]
         offsets = points - pose[:, 3]
         distances = offsets.norm(dim=-1)
         found.append(distances[offsets @ ahead > (rays @ ahead).min() * distances])
-    depths = torch.cat(found)
-    if len(depths) == 0:
-        raise InputError("no camera sees a sparse point: the poses or the points are in other axes")
-    return depths
+    return found
+
+
+def blind_cameras(camera_to_worlds: Tensor, directions: Tensor, points: Tensor | None) -> list[int]:
+    """Numbers of the cameras with no sparse point in their field of view; none are where there are
+    no points. Poses, directions and points are as of `find_bounds`."""
+    points = usable_points(points)
+    if points is None:
+        return []
+    poses, directions = (part.detach().float().cpu() for part in (camera_to_worlds, directions))
+    depths = _depths_of_each(poses, directions, points, MOST_POINTS)
+    return [number for number, seen in enumerate(depths) if not len(seen)]
 
 
 MOSTLY_ABOVE, MOSTLY_DOWN = 0.75, 0.9

@@ -11,11 +11,11 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-from leco_plugin.log import counted, say
+from leco_plugin.log import by_number, counted, say
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.region import SIDE, Region
 from leco_plugin.models.rendering import Rays
-from leco_plugin.scenes.bounds import BoundsConfig, usable_points
+from leco_plugin.scenes.bounds import BoundsConfig, blind_cameras, usable_points
 from leco_plugin.scenes.frames import data_frame_of, frame_of
 from leco_plugin.scenes.pixels.held_out_pixels import (
     HeldOutPixelSampler,
@@ -30,7 +30,14 @@ from leco_plugin.scenes.pixels.known_distances import (
     sampler_here,
     sparse_pixels,
 )
-from leco_plugin.scenes.survey import MOST_CAMERAS, Survey, covering_rays, sparse_points, survey
+from leco_plugin.scenes.survey import (
+    MOST_CAMERAS,
+    Survey,
+    chosen_cameras,
+    covering_rays,
+    sparse_points,
+    survey,
+)
 from leco_plugin.seen import rays_a_side
 
 FEW_PHOTOGRAPHS = 16
@@ -159,9 +166,19 @@ class LearningData:
             found.append(f"{few}; more, which overlap by two thirds, usually help")
         points = sparse_points(dataset)
         if usable_points(points) is None:
-            lack = "no sparse points" if points is None else f"too few sparse points, {len(points)}"
-            why = f"this scene has {lack}, so that its bounds are guessed from its cameras"
+            lack = "this scene has no sparse points"
+            if points is not None:
+                lack = f"this scene has too few sparse points, {len(points)}"
+            why = f"{lack}, so that its bounds are guessed from its cameras"
             found.append(f"{why}; `leco points SCENE` finds some (it needs pycolmap)")
+        chosen, (_, directions) = chosen_cameras(len(dataset)), covering_rays(dataset.cameras)
+        poses = dataset.cameras.camera_to_worlds[chosen]
+        if blind := blind_cameras(poses, directions, points):
+            some = f"{len(blind)} of {counted(len(chosen), 'photograph')}"
+            some += f" {by_number(len(blind), 'sees', 'see')} no sparse point, the first is "
+            some += str(dataset.image_filenames[int(chosen[blind[0]])])
+            why = "a wrong pose makes the bounds as wide as it is away"
+            found.append(f"{some}: {why}; leave its frame out, or mend it")
         return found
 
     def facts(self) -> dict[str, Any]:

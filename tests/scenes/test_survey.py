@@ -151,12 +151,25 @@ def test_rays_that_miss_are_counted() -> None:
 def test_points_that_bound_nothing_are_told_with_what_finds_more(
     count: int | None, said: str
 ) -> None:
-    dataset: Any = type("Dataset", (list,), {})(range(20))
+    dataset: Any = type("Dataset", (list,), {"cameras": ring(20)})(range(20))
     dataset.metadata = {} if count is None else {POINTS: cloud()[:count]}
     data: Any = SimpleNamespace(manager=SimpleNamespace(train_dataset=dataset))
     lines = LearningData.doubts(data)
     assert len(lines) == bool(said)
     assert all(f"this scene has {said} so that" in line for line in lines)
+
+
+def test_a_photograph_far_off_that_sees_no_point_is_named() -> None:
+    cameras = ring(20)
+    cameras.camera_to_worlds[3, :, 3] *= 1e4
+    cameras.camera_to_worlds[3, :, :3] *= torch.tensor([-1.0, 1.0, -1.0])  # and looks away
+    dataset: Any = type("Dataset", (list,), {"cameras": cameras})(range(20))
+    dataset.metadata, dataset.image_filenames = (
+        {POINTS: cloud() - 0.5},
+        [f"{i}.png" for i in range(20)],
+    )
+    (line,) = LearningData.doubts(SimpleNamespace(manager=SimpleNamespace(train_dataset=dataset)))
+    assert line.startswith("1 of 20 photographs sees no sparse point, the first is 3.png:")
 
 
 def test_points_of_no_kind_are_none() -> None:
