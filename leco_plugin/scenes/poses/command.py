@@ -84,12 +84,13 @@ def make_scene(
         models = work.map()
         work.refine(models[0], lens)
         gps = {each.name: gps for each, gps in zip(photographs, places)}
-        placement = _put_in_the_world(pycolmap, models[0], gps)
+        altitudes = any(each.position and np.isfinite(each.position[2]) for each in exifs)
+        placement = _put_in_the_world(pycolmap, models[0], gps, altitudes)
         sources = {each.name: str(each.path.relative_to(folder)) for each in photographs}
         refused = sorted(str(path.relative_to(folder)) for path in found.refused)
         report = _report(models, sources, placement) | {
             "not_read": refused,
-            "altitudes": any(each.position and np.isfinite(each.position[2]) for each in exifs),
+            "altitudes": altitudes,
             "pairs": len(chosen.pairs),
             "pairs_by": chosen.reason,
             "seconds": round(time.monotonic() - began, 1),
@@ -167,12 +168,13 @@ def _require_disk(out: Path, photographs: list[Photograph]) -> None:
     require_disk(out, len(photographs), copies, "--out")
 
 
-def _put_in_the_world(pycolmap: Any, model: Any, gps: dict[str, Any]) -> Placement:
-    """Moves a model upright, and to metres where GPS allows it."""
+def _put_in_the_world(pycolmap: Any, model: Any, gps: dict[str, Any], altitudes: bool) -> Placement:
+    """Moves a model upright, and to metres where GPS allows it, by its altitudes if it has some."""
     names, poses = poses_of(model)
     up = world.upright(poses, points_of(model)[0])
     known, top = np.array([gps[name] for name in names]), poses[:, :, 1].mean(axis=0)
-    placed = world.place(pycolmap, poses[:, :, 3], known, up, top)
+    edges = {"top": top, "rights": poses[:, :, 0]}
+    placed = world.place(pycolmap, poses[:, :, 3], known, up, **edges, altitudes=altitudes)
     model.transform(pycolmap.Sim3d(placed.scale, pycolmap.Rotation3d(placed.turn), placed.shift))
     return placed
 
@@ -183,6 +185,7 @@ def _report(models: list[Any], sources: dict[str, str], placement: Placement) ->
     lost = sorted({*sources.values()} - blocks[0])
     residuals = placement.residuals
     gps: dict[str, Any] = {"used": residuals is not None, "reason": placement.reason}
+    gps["level"] = placement.level
     if residuals is not None:
         names = [sources[name] for name in poses_of(models[0])[0]]
         gps["contradicted"] = [name for name, off in zip(names, residuals) if off > WRONG]
@@ -228,6 +231,9 @@ def summary(report: dict[str, Any]) -> list[str]:
         lines.append(f"{known}: they are off by {off}")
         if not report["altitudes"]:
             lines.append("EXIF gives no altitude: heights count from the cameras, not the sea")
+        elif gps.get("level"):
+            wrong = "altitudes in EXIF contradict the poses: heights are by their median alone"
+            lines.append(f"{wrong}, and up is what cameras and ground say")
         if wrong := gps["contradicted"]:
             much = f"GPS contradicts the poses by more than {WRONG:.0f} m"
             lines.append(f"{much}, and is not used, of {_some(wrong)}")

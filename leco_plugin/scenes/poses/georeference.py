@@ -29,6 +29,12 @@ FEWEST = 4
 """Photographs with GPS for which a similarity, of seven numbers, can be doubted."""
 AGREEING, ALWAYS = 0.5, 3
 """Share of positions that must agree with the poses, beside those few that always can."""
+TRIALS = 1000
+"""Pairs of positions by which a similarity of the plane is looked for."""
+TILT, LESS_LEVEL = 0.99, 0.7
+"""Cosine of the angle between the vertical by GPS and by cameras and ground, 8 degrees, beyond
+which one of them is wrong; and the slope of photographs' right edges (root mean square) by the
+latter, over that by GPS, below which GPS is: its altitudes drift."""
 WANDERING = 0.3
 """Length of the mean of the cameras' top axes below which they do not say what is up."""
 
@@ -43,9 +49,12 @@ class Placement:
     shift: Array
     """[3]."""
     residuals: Array | None = None
-    """[C] metres between pose and GPS, nan where there is none. None: not by GPS."""
+    """[C] metres between pose and GPS, nan where there is none; on the level where `level` is set.
+    None: not by GPS."""
     reason: str = ""
     """Why GPS is not used."""
+    level: bool = False
+    """Whether latitudes and longitudes alone were used, and what is up is what cameras see."""
 
     def apply(self, points: Array) -> Array:
         """World coordinates [N, 3] of points of the reconstruction."""
@@ -88,14 +97,71 @@ def upright(poses: Array, points: Array) -> Array:
 
 
 def place(
-    pycolmap: Any, centres: Array, gps: Array, up: Array, top: Array | None = None
+    pycolmap: Any,
+    centres: Array,
+    gps: Array,
+    up: Array,
+    top: Array | None = None,
+    rights: Array | None = None,
+    altitudes: bool = True,
 ) -> Placement:
     """The similarity that takes a reconstruction to metres, or a rotation that sets it upright.
 
     Of camera centres [C, 3] with positions by GPS [C, 3] in metres, nan where not known; a flight
     along one line also needs what is up [3] in the reconstruction. The mean `top` [3] of the
-    photographs' top edges, if given, has a word where GPS would turn that upside down.
+    photographs' top edges, if given, has a word where GPS would turn that upside down, and their
+    right edges `rights` [C, 3] have one where altitudes would tilt it. Where altitudes are not
+    known, or contradict the poses, what is up takes their place.
     """
+    placed = _place_in_space(pycolmap, centres, gps, up, top)
+    tilts = placed.residuals is not None and _is_tilted(placed.turn, up, rights)
+    if altitudes and placed.residuals is not None and not tilts:
+        return placed
+    return _place_on_the_level(centres, gps, up) or placed
+
+
+def _is_tilted(turn: Array, up: Array, rights: Array | None) -> bool:
+    """Whether a turn [3, 3] tilts what is up [3], and photographs, by their right edges [C, 3], are
+    held clearly less level so: on a slope that looked flat they are held more level."""
+    if rights is None or (turn @ up)[2] > TILT or (turn @ up)[2] < 0.0:
+        return False
+    by_gps, by_up = (float(np.sqrt((part**2).mean())) for part in (rights @ turn[2], rights @ up))
+    return by_up < LESS_LEVEL * by_gps
+
+
+def _place_on_the_level(centres: Array, gps: Array, up: Array) -> Placement | None:
+    """A placement by latitudes and longitudes alone, with `up` upright: the similarity of the plane
+    with which most positions agree. None where too few do."""
+    there = np.isfinite(gps).all(axis=1)
+    if there.sum() < FEWEST:
+        return None
+    upright_turn = _by_direction(up, "").turn
+    seen = centres[there] @ upright_turn.T
+    source, target = seen[:, 0] + 1j * seen[:, 1], gps[there, 0] + 1j * gps[there, 1]
+    width = tolerance(float(np.sqrt((np.abs(target - target.mean()) ** 2).mean())))
+    rng, best = np.random.default_rng(0), np.zeros(len(source), dtype=bool)
+    for one, other in rng.integers(0, len(source), size=(TRIALS, 2)):
+        if width > 0.0 and source[one] != source[other]:
+            factor = (target[one] - target[other]) / (source[one] - source[other])
+            off = np.abs(factor * (source - source[one]) + target[one] - target)
+            best = max(best, off <= width, key=np.sum)
+    if best.sum() - ALWAYS < AGREEING * (len(source) - ALWAYS):
+        return None
+    from_middle, to_middle = source[best] - source[best].mean(), target[best] - target[best].mean()
+    factor = np.vdot(from_middle, to_middle) / np.vdot(from_middle, from_middle)
+    scale = float(np.abs(factor))
+    turn = Rotation.from_euler("z", np.angle(factor)).as_matrix() @ upright_turn
+    offsets = gps[there] - scale * centres[there] @ turn.T
+    shift = np.array([*offsets[best, :2].mean(axis=0), np.median(offsets[:, 2])])
+    placed = Placement(scale, turn, shift, level=True)
+    return replace(placed, residuals=np.linalg.norm((placed.apply(centres) - gps)[:, :2], axis=1))
+
+
+def _place_in_space(
+    pycolmap: Any, centres: Array, gps: Array, up: Array, top: Array | None
+) -> Placement:
+    """A placement by positions with their altitudes; upright in units of its own, with the reason,
+    where these contradict the poses."""
     there = np.isfinite(gps).all(axis=1)
     known, count = gps[there], int(there.sum())
     if count < FEWEST:

@@ -86,7 +86,7 @@ def _position(gps: Mapping[int, Any]) -> Position | None:
     longitude = _degrees(gps.get(ExifTags.GPS.GPSLongitude), gps.get(ExifTags.GPS.GPSLongitudeRef))
     if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0) or latitude == longitude == 0.0:
         return None
-    altitude = _number(gps.get(ExifTags.GPS.GPSAltitude, math.nan), math.nan)
+    altitude = _number(gps.get(ExifTags.GPS.GPSAltitude), math.nan) or math.nan  # 0: not known
     # below the sea or, since EXIF 3, below the ellipsoid
     below = gps.get(ExifTags.GPS.GPSAltitudeRef) in (1, 3, b"\x01", b"\x03")
     return latitude, longitude, -altitude if below else altitude

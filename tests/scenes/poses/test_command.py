@@ -323,6 +323,9 @@ def test_photographs_whose_gps_contradicts_their_poses_are_named() -> None:
     assert report["gps"]["contradicted"] == ["2.jpg"]
     said = summary(report | {"not_read": [], "altitudes": True})
     assert said[-1] == "GPS contradicts the poses by more than 50 m, and is not used, of 2.jpg"
+    level = report | {"gps": {**report["gps"], "level": True}}
+    said = summary(level | {"not_read": [], "altitudes": True})
+    assert any("altitudes in EXIF contradict the poses" in line for line in said)
 
 
 def photographed(name: str) -> Any:

@@ -93,6 +93,13 @@ def test_an_altitude_may_be_below_the_sea() -> None:
     assert position is not None and position[2] == -12.0
 
 
+def test_an_altitude_of_nothing_at_all_is_not_known() -> None:
+    place = {1: "N", 2: (45.0, 0.0, 0.0), 3: "E", 4: (1.0, 0.0, 0.0)}
+    for altitude in ({}, {6: 0.0}):
+        position = _position({**place, 5: b"\0", **altitude})
+        assert position is not None and math.isnan(position[2])
+
+
 def test_a_picture_made_smaller_keeps_its_field_of_view() -> None:
     """The resolution of the sensor is that of the picture as it was taken."""
     taken = {0x920A: 4.3, 0xA20E: 16393.4, 0xA210: 2, 0xA002: 4000, 0xA003: 3000}

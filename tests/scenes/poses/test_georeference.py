@@ -123,6 +123,37 @@ def test_a_line_of_gps_gives_metres_by_what_is_up() -> None:
     np.testing.assert_allclose(placed.turn @ up, [0.0, 0.0, 1.0], atol=0.1)
 
 
+@pytest.mark.parametrize("kind", ["a jump", "at random", "a drift", "not known"])
+def test_wrong_altitudes_neither_tilt_a_survey_nor_cost_it_its_metres(kind: str) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    poses, _ = survey(1)
+    places = poses[:, :, 3]
+    centres, up = away(places)
+    rng, gps = np.random.default_rng(2), places.copy()
+    gps[:, :2] += rng.normal(size=(len(places), 2))
+    wrong = {"a jump": 90.0 * (places[:, 1] > 30.0), "a drift": 0.2 * places[:, 0]}
+    wrong |= {"at random": rng.uniform(0.0, 400.0, len(places)), "not known": -places[:, 2]}
+    gps[:, 2] += wrong[kind]
+    edges = {"rights": poses[:, :, 0] @ rotation(5).T, "altitudes": kind != "not known"}
+    placed = place(pycolmap, centres, gps, up, **edges)
+    assert placed.level and placed.residuals is not None and placed.residuals.max() < 5.0
+    assert placed.scale == pytest.approx(25.0, rel=0.03)
+    np.testing.assert_allclose(placed.turn @ up, [0.0, 0.0, 1.0], atol=1e-9)
+    np.testing.assert_allclose(placed.apply(centres)[:, :2], places[:, :2], atol=3.0)
+
+
+def test_on_a_slope_gps_says_what_is_up() -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    poses, _ = survey(1)
+    places = poses[:, :, 3] + 0.25 * poses[:, :1, 3] * [0.0, 0.0, 1.0]
+    centres, up = away(places)
+    slope = np.array([-0.25, 0.0, 1.0]) / math.hypot(0.25, 1.0)  # across the ground
+    seems_up = rotation(5) @ slope
+    placed = place(pycolmap, centres, places, seems_up, rights=poses[:, :, 0] @ rotation(5).T)
+    assert not placed.level
+    np.testing.assert_allclose(placed.turn @ up, [0.0, 0.0, 1.0], atol=1e-6)
+
+
 def small_survey(off_by: float) -> tuple[Array, Array, Array]:
     """Centres, what is up, and positions within 25 m that are off by a receiver's error, metres."""
     places = survey(1)[0][:, :, 3]
@@ -229,8 +260,9 @@ def estimates(found: Any) -> Any:
 
 
 def test_no_estimate_is_a_contradiction() -> None:
-    gps = survey(0)[0][:, :, 3]
-    placed = place(estimates(None), gps, gps, np.array([0.0, 0.0, 1.0]))
+    places = survey(0)[0][:, :, 3]
+    gps = np.random.default_rng(4).permutation(places)
+    placed = place(estimates(None), places, gps, np.array([0.0, 0.0, 1.0]))
     assert placed.residuals is None and ": 0 of 24 positions agree within 5.0 m" in placed.reason
 
 
