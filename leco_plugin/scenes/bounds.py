@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from leco_plugin.scenes.input_error import InputError
@@ -38,6 +39,11 @@ MOST_POINTS = 100_000
 """Of which it is told whether a camera sees any."""
 FEWEST_POINTS = 32
 """Fewer sparse points say nothing of a scene."""
+STRAY, STRAY_SEEN, CLOUD = 25.0, 0.3, 100_000
+"""Distance of a point to its eighth neighbour, over that of most points, from which on it is a
+mistake of the reconstruction: in real scenes without mistakes 23 at most. Of what is not seen from
+above, where points lie wider apart with their distance, that is also over their distance to the
+nearest camera. Neighbours are among so many points at most."""
 OVER_CAMERAS = 0.06
 """Share of the way from the ground to the highest camera by which raised bounds end above it."""
 NEAR_CAMERAS = 0.04
@@ -91,9 +97,11 @@ def find_bounds(
             remedy = "give bounds.altitudes with the z of its ground and of its top"
             raise InputError(f"{lack}: {remedy}")
         return _without_points(poses, directions)
+    from_above, seen = _seen_from_above(poses, directions, points)
+    points, left_out = _without_strays(points, None if from_above else poses)
+    seen += left_out
     low, high = _quantiles(points, 0.001), _quantiles(points, 0.999)
     near, far = _range(_depths(poses, directions, points))
-    from_above, seen = _seen_from_above(poses, directions, points)
     if from_above and config.space != "contraction":
         relief = max(float(high[2] - low[2]), 0.02 * far)
         # far below, so that a flat picture on the lower plane is plainly wrong from two places
@@ -118,6 +126,22 @@ def usable_points(points: Tensor | None) -> Tensor | None:
     points = points.detach().float().cpu()
     points = points[points.isfinite().all(dim=-1)]
     return points if len(points) >= FEWEST_POINTS else None
+
+
+def _without_strays(points: Tensor, poses: Tensor | None) -> tuple[Tensor, str]:
+    """Those of finite points [P, 3] that are not far from all others, also over the distance to the
+    nearest of poses [C, 3, 4] if given; and words on the rest, none if there is no rest."""
+    places = points.numpy()
+    some = places[:: -(-len(places) // CLOUD)]
+    gaps = torch.from_numpy(KDTree(some).query(places, k=min(9, len(some)))[0][:, -1])
+    usual = float(gaps.median())
+    strays = gaps > STRAY * usual
+    if poses is not None:
+        away = torch.from_numpy(KDTree(poses[:, :, 3].numpy()).query(places)[0])
+        strays &= gaps > STRAY_SEEN * away
+    if usual <= 0.0 or not bool(strays.any()):
+        return points, ""
+    return points[~strays], f", {int(strays.sum())} sparse points far from all others are left out"
 
 
 def with_range(bounds: SceneBounds, near: float | None, far: float | None) -> SceneBounds:

@@ -86,6 +86,27 @@ def test_a_ray_that_hardly_goes_down_widens_the_box_as_far_as_it_is_marched() ->
     assert bounds.far < 40.0 and -6.0 - 1.1 * bounds.far < left < -6.0 - 0.9 * bounds.far
 
 
+@pytest.mark.parametrize("make", [from_above, around])
+def test_a_few_points_far_from_all_others_do_not_widen_the_bounds(make) -> None:
+    poses, directions, points = make()
+    usual = find_bounds(poses, directions, points)
+    strays = 200.0 * torch.randn(20, 3, generator=torch.Generator().manual_seed(1))
+    bounds = find_bounds(poses, directions, torch.cat([points, strays]))
+    assert bounds.far == pytest.approx(usual.far, rel=0.05)
+    assert bounds.half_extent == pytest.approx(usual.half_extent, rel=0.05)
+    assert "20 sparse points far from all others are left out" in bounds.reason
+    assert "left out" not in usual.reason
+
+
+def test_a_sparse_background_is_no_stray() -> None:
+    poses, directions, points = around()
+    walls = torch.nn.functional.normalize(
+        torch.randn(1500, 3, generator=torch.Generator().manual_seed(1)), dim=-1
+    )
+    bounds = find_bounds(poses, directions, torch.cat([points, 30.0 * walls]))
+    assert bounds.far > 30.0 and "left out" not in bounds.reason
+
+
 def test_marched_samples_of_a_box_lie_in_its_space() -> None:
     poses, directions, points = from_above()
     bounds = find_bounds(poses, directions, points)
