@@ -207,6 +207,9 @@ FEW = 40
 """Up to so many photographs are all compared: 780 pairs, two minutes of one core."""
 NEIGHBOURS = 16
 """Nearest photographs by position that each is compared with."""
+SECTORS, IN_A_SECTOR = 8, 2
+"""Directions around each photograph, and nearest photographs in each of them that it is compared
+with too: where photographs of a line lie much closer than lines do, all nearest are of one line."""
 WIDE = 20.0
 """Metres from their middle, in the median, from which on positions tell who sees the same."""
 ASTRAY = 0.7
@@ -234,7 +237,7 @@ def choose_pairs(names: Sequence[str], exifs: Sequence[Exif], places: NDArray[np
     known = np.isfinite(places[:, 0])
     numbers = known.nonzero()[0]
     if count > FEW and known.mean() >= 0.5 and _spread(places[known, :2]) >= WIDE:
-        near = _near(places[numbers, :2], np.arange(NEIGHBOURS))
+        near = _near(places[numbers, :2], np.arange(NEIGHBOURS)) | _around(places[numbers, :2])
         found = {(int(numbers[one]), int(numbers[other])) for one, other in near}
         contradict = order is not None and _is_astray(places[order, :2])
         found |= _in_order(order or [], steps if contradict else (1, 2))
@@ -306,6 +309,21 @@ def _near(
         distances[row] = np.inf
         order = np.argsort(distances, kind="stable")[ranks[ranks < len(places)]]
         found |= {(min(row, o), max(row, o)) for o in order.tolist() if distances[o] < np.inf}
+    return found
+
+
+def _around(places: NDArray[np.float64]) -> set[tuple[int, int]]:
+    """Pairs of each photograph with the nearest to its place [N, 2] in each direction."""
+    found = set()
+    for row in range(len(places)):
+        east, north = (places - places[row]).T
+        order = np.argsort(east**2 + north**2, kind="stable")
+        order = order[order != row]
+        turns = np.arctan2(north[order], east[order]) / (2.0 * np.pi)
+        sectors = np.round(turns * SECTORS).astype(int) % SECTORS
+        for sector in range(SECTORS):
+            for other in order[sectors == sector][:IN_A_SECTOR].tolist():
+                found.add((min(row, other), max(row, other)))
     return found
 
 

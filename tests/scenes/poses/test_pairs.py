@@ -47,6 +47,16 @@ def test_near_photographs_are_compared_by_gps_and_far_ones_are_not() -> None:
     assert all(one < other for one, other in found.pairs)
 
 
+def test_lines_of_a_flight_are_compared_however_close_the_photographs_of_one_line_are() -> None:
+    line, along = np.divmod(np.arange(600), 60)
+    along = np.where(line % 2, 59 - along, along)  # to and fro, 40 m apart, every 3 m
+    places = np.stack([3.0 * along, 40.0 * line, np.full(600, 90.0)], axis=1)
+    found = choose_pairs(names(600), [Exif()] * 600, places)
+    next_line = {(one, line[other]) for one, other in found.pairs if line[other] == line[one] + 1}
+    assert len({one for one, _ in next_line}) == 540, "each photograph but those of the last line"
+    assert len(found.pairs) <= 600 * 2 * NEIGHBOURS
+
+
 def test_pairs_that_are_not_compared_take_no_memory() -> None:
     places = np.array(grid(30, 20, step=20.0))
     tracemalloc.start()
