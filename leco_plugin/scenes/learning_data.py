@@ -35,6 +35,7 @@ from leco_plugin.scenes.survey import (
     Survey,
     chosen_cameras,
     covering_rays,
+    far_cameras,
     sparse_points,
     survey,
 )
@@ -179,7 +180,7 @@ class LearningData:
             some += str(dataset.image_filenames[int(chosen[blind[0]])])
             why = "a wrong pose makes the bounds as wide as it is away"
             found.append(f"{some}: {why}; leave its frame out, or mend it")
-        return found
+        return found + far_cameras(dataset)
 
     def facts(self) -> dict[str, Any]:
         """What the report of an occupancy says of its data, as JSON values."""

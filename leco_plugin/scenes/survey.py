@@ -4,6 +4,7 @@ counted in the smallest things that the photographs resolve."""
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -30,6 +31,9 @@ SIDE = 8
 MOST_CAMERAS = 256
 WORTH_IT = 0.005
 """Share of all rays that must show something beyond a survey from the air, to raise its bounds."""
+FAR_CAMERA, NAMED = 20.0, 5
+"""Distance from the middle, over that of half of the cameras, from which on a pose is doubted; and
+how many photographs are named."""
 MOST_PICTURES = 16
 """Pictures that are opened to see what lies beyond: those with the most rays that miss."""
 
@@ -196,6 +200,24 @@ def covering_rays(
     )
     shape = len(chosen), side * side, 3
     return bundle.origins.float().view(shape), bundle.directions.float().view(shape)
+
+
+def far_cameras(dataset: Any) -> list[str]:
+    """A line on a dataset's cameras that are much farther from the middle than most, if any are: a
+    wrong pose squeezes all others into a small part of the scene."""
+    places = dataset.cameras.camera_to_worlds[:, :3, 3].double().cpu()
+    away = (places - places.median(dim=0).values).norm(dim=-1)
+    times = away / away.median().clamp(min=1e-12)
+    far = (times > FAR_CAMERA).nonzero().flatten().tolist()
+    if not far:
+        return []
+    named = ", ".join(Path(dataset.image_filenames[number]).name for number in far[:NAMED])
+    named += f" and {len(far) - NAMED} more" if len(far) > NAMED else ""
+    most = f"up to {float(times.max()):.0f} times as far from the middle as half of the cameras"
+    remedy = (
+        "leave them out if their poses are wrong, or the others share a small part of the scene"
+    )
+    return [f"photographed from {most}: {named}; {remedy}"]
 
 
 def seen_beyond(dataset: Any, numbers: Tensor, misses: Tensor) -> float:

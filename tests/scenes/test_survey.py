@@ -26,6 +26,7 @@ from leco_plugin.scenes.survey import (
     announce,
     bright,
     covering_rays,
+    far_cameras,
     lengths_inside,
     seen_beyond,
     sparse_points,
@@ -47,6 +48,15 @@ def cloud() -> torch.Tensor:
 def datamanager(cameras: Cameras, points: torch.Tensor | None = None) -> SimpleNamespace:
     metadata = {} if points is None else {POINTS: points}
     return SimpleNamespace(train_dataset=SimpleNamespace(cameras=cameras, metadata=metadata))
+
+
+def test_a_camera_that_is_very_far_from_all_others_is_named() -> None:
+    cameras = ring()
+    dataset = SimpleNamespace(cameras=cameras, image_filenames=[f"{i}.jpg" for i in range(8)])
+    assert far_cameras(dataset) == []
+    cameras.camera_to_worlds[5, 0, 3] += 400.0
+    (line,) = far_cameras(dataset)
+    assert ": 5.jpg; leave them out if their poses are wrong" in line
 
 
 def test_rays_cover_each_image_and_are_of_unit_length() -> None:
