@@ -39,6 +39,9 @@ GROWTH = 3
 """Bytes of a copy that is written anew over those of its original: of JPEG 1.7 to 2.1 were seen."""
 WRONG = 50.0
 """Metres from its pose beyond which a position by GPS is no scatter: its photograph is named."""
+ASTRAY = 10.0
+"""Distance from its pose, in medians of all and at least as many metres, from which on a position
+does not scatter as the others do: its photograph is named too."""
 FEW_PLACED = 0.8
 """Share of the photographs up to which a line says what places more."""
 NAMED = 5
@@ -191,6 +194,8 @@ def _report(models: list[Any], sources: dict[str, str], placement: Placement) ->
         gps["contradicted"] = [name for name, off in zip(names, residuals) if off > WRONG]
         known = residuals[residuals <= WRONG]
         median, most = (round(float(part(known)), 3) for part in (np.median, np.max))
+        usual = ASTRAY * max(1.0, median)
+        gps["astray"] = [name for name, off in zip(names, residuals) if usual < off <= WRONG]
         gps |= {"photographs": len(known), "median_metres": median, "most_metres": most}
     return {
         "format": 1,
@@ -234,6 +239,9 @@ def summary(report: dict[str, Any]) -> list[str]:
         elif gps.get("level"):
             wrong = "altitudes in EXIF contradict the poses: heights are by their median alone"
             lines.append(f"{wrong}, and up is what cameras and ground say")
+        if astray := gps.get("astray"):
+            much = f"{len(astray)} of these are off much farther than the rest"
+            lines.append(f"{much}, as with another zoom or wrong GPS: {_some(astray)}")
         if wrong := gps["contradicted"]:
             much = f"GPS contradicts the poses by more than {WRONG:.0f} m"
             lines.append(f"{much}, and is not used, of {_some(wrong)}")

@@ -42,7 +42,7 @@ class Exif(NamedTuple):
     time: float | None = None
     """Seconds, of the camera's clock."""
     camera: str = ""
-    """Maker, model and focal length: the same of photographs that share a lens."""
+    """Maker, model, focal length and zoom: the same of photographs that share a lens."""
     focal: float | None = None
     """Focal length over the longest side of the picture."""
 
@@ -56,6 +56,8 @@ def read_exif(image: Image.Image) -> Exif:
     except Exception:  # noqa: BLE001  damaged EXIF raises whatever its parser meets
         return Exif()
     lens = [_number(details.get(tag)) for tag in (0x920A, 0xA405)]
+    zoom = _number(details.get(ExifTags.Base.DigitalZoomRatio))
+    lens += [zoom] if zoom > 1.0 else []  # 0 is another word for none
     camera = " ".join(str(part) for part in (tags.get(0x010F), tags.get(0x0110), *lens))
     return Exif(_position(gps), _time(details), camera, focal_length(details, image.size))
 

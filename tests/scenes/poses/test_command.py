@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -320,12 +321,28 @@ def test_photographs_whose_gps_contradicts_their_poses_are_named() -> None:
     placement = Placement(1.0, np.eye(3), np.zeros(3), off)
     report = _report([model], {f"{number}.jpg": f"{number}.jpg" for number in range(5)}, placement)
     assert report["gps"]["photographs"] == 3 and report["gps"]["most_metres"] == 3.0
-    assert report["gps"]["contradicted"] == ["2.jpg"]
+    assert report["gps"]["contradicted"] == ["2.jpg"] and report["gps"]["astray"] == []
+    farther = replace(placement, residuals=np.where(off == 3.0, 30.0, off))
+    assert _report([model], {f"{n}.jpg": f"{n}.jpg" for n in range(5)}, farther)["gps"][
+        "astray"
+    ] == ["3.jpg"]
     said = summary(report | {"not_read": [], "altitudes": True})
     assert said[-1] == "GPS contradicts the poses by more than 50 m, and is not used, of 2.jpg"
     level = report | {"gps": {**report["gps"], "level": True}}
     said = summary(level | {"not_read": [], "altitudes": True})
     assert any("altitudes in EXIF contradict the poses" in line for line in said)
+
+
+def test_photographs_that_lie_astray_of_their_gps_are_named_where_the_others_do_not() -> None:
+    gps = {"used": True, "photographs": 9, "median_metres": 0.3, "most_metres": 27.0}
+    report = {
+        **{"photographs": 9, "placed": 9, "points": 9, "reprojection_error": 0.5},
+        **{"not_placed": [], "not_read": [], "other_blocks": [], "altitudes": True},
+    }
+    said = summary(report | {"gps": {**gps, "astray": ["zoomed.jpg"], "contradicted": []}})
+    assert said[-1].endswith("as with another zoom or wrong GPS: zoomed.jpg")
+    said = summary(report | {"gps": {**gps, "astray": [], "contradicted": []}})
+    assert not any("zoom" in line for line in said)
 
 
 def photographed(name: str) -> Any:

@@ -28,6 +28,15 @@ def test_position_time_and_lens_are_read() -> None:
     assert found.focal == pytest.approx(FOCAL / 320, rel=0.02)
 
 
+def test_a_digital_zoom_makes_another_lens() -> None:
+    lenses = []
+    for zoom in (None, 0.0, 1.0, 2.0):
+        exif = Image.Exif()
+        exif[0x8769] = {0xA405: 28} | ({} if zoom is None else {0xA404: zoom})
+        lenses.append(read(exif).camera)
+    assert lenses[0] == lenses[1] == lenses[2] != lenses[3]
+
+
 @pytest.mark.parametrize(
     ("gps", "wanted"),
     [
