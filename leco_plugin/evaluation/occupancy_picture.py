@@ -22,6 +22,7 @@ from leco_plugin.evaluation.inspection import (
     whole_box,
 )
 from leco_plugin.occupancy import CALIBRATED_AT, Occupancy
+from leco_plugin.scenes.bounds import FAR_CAMERA, distances_from_middle
 
 Array = NDArray[Any]
 
@@ -151,7 +152,8 @@ def draw_slice(
         x, y = cameras[:, across], cameras[:, up]
         axes.scatter(x, y, s=9, c=CAMERA, edgecolors="black", linewidths=0.3, label="cameras")
         axes.set(xlim=extent[:2], ylim=extent[2:])
-    drawn = f", {AXES[up]} drawn {longer:.1f} times as long" if longer > 1.0 else ""
+    between = "\n" if normal == 2 else ", "  # the upper slices are narrower
+    drawn = f"{between}{AXES[up]} drawn {longer:.1f} times as long" if longer > 1.0 else ""
     axes.set_title(f"o(x) at {AXES[normal]} = {at:.4g}{drawn}", fontsize=11)
     axes.set(xlabel=AXES[across], ylabel=AXES[up])
     axes.tick_params(labelsize=9)
@@ -171,10 +173,13 @@ def middle_of(points: Tensor, box: ViewBox) -> Tensor:
 
 
 def interesting_box(occupancy: Occupancy, cameras: Tensor) -> ViewBox:
-    """The box around what is kept and the cameras, inside the occupancy's whole box."""
+    """The box around what is kept and the cameras, but for those far from all others, inside the
+    occupancy's whole box."""
     whole = whole_box(occupancy)
     _, positions, kept = _kept_cells(occupancy, whole, SEARCH_CELLS)
     inside = ((cameras >= whole.low) & (cameras <= whole.high)).all(dim=-1)
+    if len(cameras):
+        inside &= distances_from_middle(cameras) <= FAR_CAMERA
     found = torch.cat([positions[kept], cameras[inside]])
     if len(found) == 0:
         return whole

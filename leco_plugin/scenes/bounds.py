@@ -44,6 +44,8 @@ STRAY, STRAY_SEEN, CLOUD = 25.0, 0.3, 100_000
 mistake of the reconstruction: in real scenes without mistakes 23 at most. Of what is not seen from
 above, where points lie wider apart with their distance, that is also over their distance to the
 nearest camera. Neighbours are among so many points at most."""
+FAR_CAMERA = 20.0
+"""Distance of a camera from the middle, over that of half of them, from which on it is far."""
 OVER_CAMERAS = 0.06
 """Share of the way from the ground to the highest camera by which raised bounds end above it."""
 NEAR_CAMERAS = 0.04
@@ -142,6 +144,12 @@ def _without_strays(points: Tensor, poses: Tensor | None) -> tuple[Tensor, str]:
     if usual <= 0.0 or not bool(strays.any()):
         return points, ""
     return points[~strays], f", {int(strays.sum())} sparse points far from all others are left out"
+
+
+def distances_from_middle(places: Tensor) -> Tensor:
+    """Distances [C] of cameras at places [C, 3] from their middle, over that of half of them."""
+    away = (places - places.median(dim=0).values).norm(dim=-1)
+    return away / away.median().clamp(min=1e-12)
 
 
 def with_range(bounds: SceneBounds, near: float | None, far: float | None) -> SceneBounds:

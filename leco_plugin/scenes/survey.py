@@ -15,8 +15,10 @@ from leco_plugin.log import summarize
 from leco_plugin.models.objective import DARK
 from leco_plugin.samplers.boxes import intersect_box
 from leco_plugin.scenes.bounds import (
+    FAR_CAMERA,
     BoundsConfig,
     SceneBounds,
+    distances_from_middle,
     find_bounds,
     raise_to_cameras,
     usable_points,
@@ -31,9 +33,8 @@ SIDE = 8
 MOST_CAMERAS = 256
 WORTH_IT = 0.005
 """Share of all rays that must show something beyond a survey from the air, to raise its bounds."""
-FAR_CAMERA, NAMED = 20.0, 5
-"""Distance from the middle, over that of half of the cameras, from which on a pose is doubted; and
-how many photographs are named."""
+NAMED = 5
+"""Photographs that are named in a line."""
 MOST_PICTURES = 16
 """Pictures that are opened to see what lies beyond: those with the most rays that miss."""
 
@@ -205,9 +206,7 @@ def covering_rays(
 def far_cameras(dataset: Any) -> list[str]:
     """A line on a dataset's cameras that are much farther from the middle than most, if any are: a
     wrong pose squeezes all others into a small part of the scene."""
-    places = dataset.cameras.camera_to_worlds[:, :3, 3].double().cpu()
-    away = (places - places.median(dim=0).values).norm(dim=-1)
-    times = away / away.median().clamp(min=1e-12)
+    times = distances_from_middle(dataset.cameras.camera_to_worlds[:, :3, 3].double().cpu())
     far = (times > FAR_CAMERA).nonzero().flatten().tolist()
     if not far:
         return []

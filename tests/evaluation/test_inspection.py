@@ -77,6 +77,15 @@ def test_what_is_drawn_is_what_is_kept_and_the_cameras() -> None:
     assert float(watched.high[2]) > 1.8
 
 
+def test_a_camera_far_from_all_others_does_not_shrink_what_is_drawn() -> None:
+    near = cameras_of(ball())
+    middle = torch.tensor(CENTRE) + torch.tensor([0.0, 0.0, RADIUS])
+    many = middle + 0.001 * torch.randn(9, 3, generator=torch.Generator().manual_seed(0))
+    far = torch.cat([many, near[near[:, 2].argmax()][None]])
+    box, usual = interesting_box(ball(), far), interesting_box(ball(), many)
+    assert torch.equal(box.low, usual.low) and torch.equal(box.high, usual.high)
+
+
 def test_points_are_on_the_surface_and_face_outwards() -> None:
     points, normals = surface_points(ball(), whole_box(ball()), -10.0)
     offsets = points - torch.tensor(CENTRE)
