@@ -6,6 +6,7 @@ import hashlib
 import json
 import shutil
 import time
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -223,7 +224,7 @@ def summary(report: dict[str, Any]) -> list[str]:
     if blocks := report["other_blocks"]:
         named = "; ".join(_some(block) for block in blocks[:NAMED])
         lines.append(
-            f"{sum(map(len, blocks))} of these fit together only in groups of their own, which "
+            f"{len({*chain(*blocks)})} of these fit together only in groups of their own, which "
             f"share too little with the rest: {named}; for a scene of such a group, give leco "
             "poses a folder with its photographs alone"
         )

@@ -298,6 +298,8 @@ def test_the_summary_names_some_and_counts_the_rest() -> None:
         "in metres by the GPS of 8 photographs: they are off by 1.23 m (median) and 5.00 m at most",
         "EXIF gives no altitude: heights count from the cameras, not the sea",
     ]
+    groups = report | {"other_blocks": [["0.jpg", "1.jpg", "2.jpg"], ["2.jpg", "3.jpg"]]}
+    assert any(line.startswith("4 of these fit together only in") for line in summary(groups))
 
 
 @pytest.mark.parametrize(("placed", "advised"), [(8, True), (9, False)])
