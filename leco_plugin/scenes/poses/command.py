@@ -17,7 +17,12 @@ from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.poses import ASKED
 from leco_plugin.scenes.poses import georeference as world
 from leco_plugin.scenes.poses.georeference import MODEL, POINTS, Placement, points_of, poses_of
-from leco_plugin.scenes.poses.originals import Photograph, copy_photographs, find_photographs
+from leco_plugin.scenes.poses.originals import (
+    Photograph,
+    copy_photographs,
+    find_photographs,
+    without_repeats,
+)
 from leco_plugin.scenes.poses.reconstruction import (
     ENTERED,
     MODELS,
@@ -61,7 +66,7 @@ def make_scene(
     check_options(size, threads)
     pycolmap = load_pycolmap()
     folder, out, began = folder.resolve(), out.resolve(), time.monotonic()
-    found = find_photographs(folder, out)
+    found = without_repeats(find_photographs(folder, out))
     asked = _asked(found.photographs, lens, size)
     if finished := _finished(out, asked):
         print(f"{out} already holds this scene: nothing is done")
@@ -91,9 +96,11 @@ def make_scene(
         altitudes = any(each.position and np.isfinite(each.position[2]) for each in exifs)
         placement = _put_in_the_world(pycolmap, models[0], gps, altitudes)
         sources = {each.name: str(each.path.relative_to(folder)) for each in photographs}
-        refused = sorted(str(path.relative_to(folder)) for path in found.refused)
+        refused = {str(path.relative_to(folder)) for path in found.refused}
+        repeats = {str(path.relative_to(folder)) for path in found.repeats}
         report = _report(models, sources, placement) | {
-            "not_read": refused,
+            "not_read": sorted(refused - repeats),
+            "repeats": sorted(repeats),
             "altitudes": altitudes,
             "pairs": len(chosen.pairs),
             "pairs_by": chosen.reason,
@@ -219,6 +226,8 @@ def summary(report: dict[str, Any]) -> list[str]:
     ]
     if unread := report["not_read"]:
         lines.append(f"left out, as they cannot be read: {_some(unread)}")
+    if repeats := report.get("repeats"):
+        lines.append(f"left out, as copies of others: {_some(repeats)}")
     if lost := report["not_placed"]:
         lines.append(f"not placed: {_some(lost)}")
     if blocks := report["other_blocks"]:

@@ -11,11 +11,16 @@ import numpy as np
 import pytest
 from PIL import Image
 from rendered_survey import exif_of, odd_exif
+from scene_files import refused
 
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photograph_files import decode
 from leco_plugin.scenes.poses import originals
-from leco_plugin.scenes.poses.originals import copy_photographs, find_photographs
+from leco_plugin.scenes.poses.originals import (
+    copy_photographs,
+    find_photographs,
+    without_repeats,
+)
 
 
 @pytest.fixture
@@ -120,6 +125,20 @@ def test_photographs_of_other_folders_and_names_do_not_collide(
     assert len({name.lower() for name in names}) == 6
     assert not any(" " in name or "/" in name for name in names)
     assert sum(name.endswith("more_of_it_IMG_0.JPG") for name in names) == 1
+
+
+def test_a_photograph_that_is_there_twice_is_used_once(folder: Path, tmp_path: Path) -> None:
+    (folder / "again").mkdir()
+    (folder / "again" / "IMG_0.jpg").write_bytes((folder / "IMG_0.jpg").read_bytes())
+    (folder / "again" / "other.jpg").write_bytes((folder / "IMG_1.jpg").read_bytes() + b"x")
+    found = without_repeats(find_photographs(folder, tmp_path / "out"))
+    assert found.repeats == (folder / "again" / "IMG_0.jpg",) and len(found.photographs) == 4
+    (line,) = found.refused.values()
+    assert line.endswith(f"is the same file as {folder / 'IMG_0.jpg'}")
+    for path in (folder / "IMG_2.jpg", folder / "again" / "other.jpg"):
+        path.unlink()
+    with refused("is the same file as .*2 of 3 photographs can be used"):
+        without_repeats(find_photographs(folder, tmp_path / "out"))
 
 
 def test_a_number_that_tells_two_apart_is_nobody_elses_name(tmp_path: Path) -> None:
