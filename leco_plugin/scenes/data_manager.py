@@ -195,15 +195,25 @@ def upright_outputs(read: Callable[..., DataparserOutputs]) -> Callable[..., Dat
     return outputs_of
 
 
+LIES_DOWN = 45.0
+"""Degrees from upright at which a survey is doubted to stand, whatever its file says."""
+
+
 def _turn_of(outputs: DataparserOutputs) -> Tensor | None:
     """What sets a scene upright, said in the log; None where nothing is to be done."""
-    if UP_IS_KNOWN in outputs.metadata:
-        return None
     turn = turn_to_upright(outputs.cameras.camera_to_worlds, points_in(outputs.metadata))
-    if turn is not None:
-        degrees = math.degrees(math.acos(max(-1.0, min(1.0, float(turn[2, 2])))))
-        done = f"the survey lies on its side and is set upright, by {degrees:.0f} degrees"
-        say(f"{done}; --pipeline.datamanager.upright False leaves it as it is")
+    if turn is None:
+        return None
+    degrees = math.degrees(math.acos(max(-1.0, min(1.0, float(turn[2, 2])))))
+    if UP_IS_KNOWN in outputs.metadata:
+        if degrees > LIES_DOWN:
+            lies = (
+                f"the survey seems to lie on its side, by {degrees:.0f} degrees, and its file says"
+            )
+            say(f"{lies} that z is up; if it is not, take orientation_override out of the file")
+        return None
+    done = f"the survey lies on its side and is set upright, by {degrees:.0f} degrees"
+    say(f"{done}; --pipeline.datamanager.upright False leaves it as it is")
     return turn
 
 

@@ -13,6 +13,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from scene_files import change, described, read_ply, write_ply
 from torch import Tensor
 
+from leco_plugin.scenes import data_manager
 from leco_plugin.scenes.city.cameras import look_at
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig, upright_outputs
 from leco_plugin.scenes.frames import _vertical_of, turn_to_upright
@@ -181,6 +182,18 @@ def _leads_back(outputs: Any, scene: Path) -> None:
         torch.testing.assert_close(place.float(), camera[:, 3], atol=1e-5, rtol=0)
         turned = (transform[:, :3] @ pose[:3, :3]).float()
         torch.testing.assert_close(turned, camera[:, :3], atol=1e-5, rtol=0)
+
+
+def test_a_file_that_says_z_is_up_where_it_is_not_is_believed_and_doubted(
+    colmap_scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(data_manager, "say", said.append)
+    change(colmap_scene, lambda meta: meta.update(orientation_override="none"))
+    parser = LecoPhotographsDataParserConfig(data=colmap_scene)
+    manager: Any = LecoDataManagerConfig(dataparser=parser).setup(device="cpu")
+    assert not bool((manager.train_dataset.cameras.camera_to_worlds[:, 2, 2] > 0.9).any())
+    assert sum("take orientation_override out of the file" in line for line in said) == 1
 
 
 def test_it_is_left_on_its_side_where_that_is_asked_for(colmap_scene: Path) -> None:
