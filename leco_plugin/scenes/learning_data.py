@@ -11,11 +11,11 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-from leco_plugin.log import by_number, counted, say
+from leco_plugin.log import counted, say
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.region import SIDE, Region
 from leco_plugin.models.rendering import Rays
-from leco_plugin.scenes.bounds import BoundsConfig, blind_cameras, usable_points
+from leco_plugin.scenes.bounds import BoundsConfig, usable_points
 from leco_plugin.scenes.frames import data_frame_of, frame_of
 from leco_plugin.scenes.pixels.held_out_pixels import (
     HeldOutPixelSampler,
@@ -33,9 +33,8 @@ from leco_plugin.scenes.pixels.known_distances import (
 from leco_plugin.scenes.survey import (
     MOST_CAMERAS,
     Survey,
-    chosen_cameras,
     covering_rays,
-    far_cameras,
+    doubtful_cameras,
     sparse_points,
     survey,
 )
@@ -172,15 +171,7 @@ class LearningData:
                 lack = f"this scene has too few sparse points, {len(points)}"
             why = f"{lack}, so that its bounds are guessed from its cameras"
             found.append(f"{why}; `leco points SCENE` finds some (it needs pycolmap)")
-        chosen, (_, directions) = chosen_cameras(len(dataset)), covering_rays(dataset.cameras)
-        poses = dataset.cameras.camera_to_worlds[chosen]
-        if blind := blind_cameras(poses, directions, points):
-            some = f"{len(blind)} of {counted(len(chosen), 'photograph')}"
-            some += f" {by_number(len(blind), 'sees', 'see')} no sparse point, the first is "
-            some += str(dataset.image_filenames[int(chosen[blind[0]])])
-            why = "a wrong pose makes the bounds as wide as it is away"
-            found.append(f"{some}: {why}; leave its frame out, or mend it")
-        return found + far_cameras(dataset)
+        return found + doubtful_cameras(dataset)
 
     def facts(self) -> dict[str, Any]:
         """What the report of an occupancy says of its data, as JSON values."""

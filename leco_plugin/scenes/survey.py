@@ -3,6 +3,7 @@ counted in the smallest things that the photographs resolve."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from leco_plugin.scenes.bounds import (
     FAR_CAMERA,
     BoundsConfig,
     SceneBounds,
+    blind_cameras,
     distances_from_middle,
     find_bounds,
     raise_to_cameras,
@@ -203,20 +205,30 @@ def covering_rays(
     return bundle.origins.float().view(shape), bundle.directions.float().view(shape)
 
 
-def far_cameras(dataset: Any) -> list[str]:
-    """A line on a dataset's cameras that are much farther from the middle than most, if any are: a
-    wrong pose squeezes all others into a small part of the scene."""
-    times = distances_from_middle(dataset.cameras.camera_to_worlds[:, :3, 3].double().cpu())
+def doubtful_cameras(dataset: Any) -> list[str]:
+    """Lines on a dataset's cameras whose poses may be wrong: those much farther from the middle
+    than most, which squeeze all others into a small part of the scene; and others with no sparse
+    point in their field of view, which make its bounds as wide as they are away."""
+    poses, lines = dataset.cameras.camera_to_worlds, []
+    times = distances_from_middle(poses[:, :3, 3].double().cpu())
     far = (times > FAR_CAMERA).nonzero().flatten().tolist()
-    if not far:
-        return []
-    named = ", ".join(Path(dataset.image_filenames[number]).name for number in far[:NAMED])
-    named += f" and {len(far) - NAMED} more" if len(far) > NAMED else ""
-    most = f"up to {float(times.max()):.0f} times as far from the middle as half of the cameras"
-    remedy = (
-        "leave them out if their poses are wrong, or the others share a small part of the scene"
-    )
-    return [f"photographed from {most}: {named}; {remedy}"]
+    if far:
+        most = f"up to {float(times.max()):.0f} times as far from the middle as half of the cameras"
+        why = "the others share a small part of the scene"
+        lines.append(f"photographed from {most}: {_named(dataset, far)}; {why}")
+    chosen, (_, directions) = chosen_cameras(len(poses)), covering_rays(dataset.cameras)
+    found = blind_cameras(poses[chosen], directions, sparse_points(dataset))
+    if blind := [number for number in chosen[found].tolist() if number not in far]:
+        why = "the bounds become as wide as they are away"
+        lines.append(f"in view of no sparse point: {_named(dataset, blind)}; {why}")
+    remedy = "if their poses are wrong, leave their frames out or mend them"
+    return [f"{line}; {remedy}" for line in lines]
+
+
+def _named(dataset: Any, numbers: Sequence[int]) -> str:
+    """Some photographs of a dataset, the first of them by name."""
+    named = ", ".join(Path(dataset.image_filenames[number]).name for number in numbers[:NAMED])
+    return named + (f" and {len(numbers) - NAMED} more" if len(numbers) > NAMED else "")
 
 
 def seen_beyond(dataset: Any, numbers: Tensor, misses: Tensor) -> float:

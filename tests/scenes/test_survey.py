@@ -26,7 +26,6 @@ from leco_plugin.scenes.survey import (
     announce,
     bright,
     covering_rays,
-    far_cameras,
     lengths_inside,
     seen_beyond,
     sparse_points,
@@ -48,15 +47,6 @@ def cloud() -> torch.Tensor:
 def datamanager(cameras: Cameras, points: torch.Tensor | None = None) -> SimpleNamespace:
     metadata = {} if points is None else {POINTS: points}
     return SimpleNamespace(train_dataset=SimpleNamespace(cameras=cameras, metadata=metadata))
-
-
-def test_a_camera_that_is_very_far_from_all_others_is_named() -> None:
-    cameras = ring()
-    dataset = SimpleNamespace(cameras=cameras, image_filenames=[f"{i}.jpg" for i in range(8)])
-    assert far_cameras(dataset) == []
-    cameras.camera_to_worlds[5, 0, 3] += 400.0
-    (line,) = far_cameras(dataset)
-    assert ": 5.jpg; leave them out if their poses are wrong" in line
 
 
 def test_rays_cover_each_image_and_are_of_unit_length() -> None:
@@ -169,17 +159,22 @@ def test_points_that_bound_nothing_are_told_with_what_finds_more(
     assert all(f"this scene has {said} so that" in line for line in lines)
 
 
-def test_a_photograph_far_off_that_sees_no_point_is_named() -> None:
+@pytest.mark.parametrize("far", [False, True])
+def test_photographs_far_off_or_without_a_point_in_view_are_named_once(far: bool) -> None:
     cameras = ring(20)
-    cameras.camera_to_worlds[3, :, 3] *= 1e4
-    cameras.camera_to_worlds[3, :, :3] *= torch.tensor([-1.0, 1.0, -1.0])  # and looks away
+    files = [f"{number}.png" for number in range(20)]
     dataset: Any = type("Dataset", (list,), {"cameras": cameras})(range(20))
-    dataset.metadata, dataset.image_filenames = (
-        {POINTS: cloud() - 0.5},
-        [f"{i}.png" for i in range(20)],
-    )
-    (line,) = LearningData.doubts(SimpleNamespace(manager=SimpleNamespace(train_dataset=dataset)))
-    assert line.startswith("1 of 20 photographs sees no sparse point, the first is 3.png:")
+    dataset.metadata, dataset.image_filenames = {POINTS: cloud() - 0.5}, files
+    data: Any = SimpleNamespace(manager=SimpleNamespace(train_dataset=dataset))
+    assert LearningData.doubts(data) == []
+    cameras.camera_to_worlds[3:5, :, :3] *= torch.tensor([-1.0, 1.0, -1.0])  # they look away
+    cameras.camera_to_worlds[4, :, 3] *= 1e4 if far else 1.0
+    *of_far, away = LearningData.doubts(data)
+    blind = "3.png" if far else "3.png, 4.png"
+    assert away.startswith(f"in view of no sparse point: {blind}; the bounds become as wide as")
+    assert len(of_far) == far
+    assert all("as half of the cameras: 4.png; the others share" in line for line in of_far)
+    assert away.endswith("; if their poses are wrong, leave their frames out or mend them")
 
 
 def test_points_of_no_kind_are_none() -> None:
