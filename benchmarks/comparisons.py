@@ -73,10 +73,10 @@ def in_words(found: Sequence[Comparison], table_is: str) -> str:
 
 
 def _standing(found: Sequence[Comparison]) -> str:
-    """Such as "is ahead in 2 of 6, undecided in 3, of one seed in 1"."""
+    """Such as "is ahead in 2 of 6, undecided in 3, without a verdict in 1"."""
     counts = Counter(_verdict(one).word for one in found)
     rest = [f"{word} in {counts[word]}" for word in ("level", "undecided") if counts[word]]
-    rest += [f"of one seed in {counts[None]}"] if counts[None] else []
+    rest += [f"without a verdict in {counts[None]}"] if counts[None] else []
     return ", ".join([f"is ahead in {counts['ahead']} of {len(found)}", *rest])
 
 

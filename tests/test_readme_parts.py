@@ -83,8 +83,9 @@ def test_every_stored_chart_is_compared_with_its_best_row(four_charts: None) -> 
     assert comparisons.in_words(found, "page.md") == (
         "**In 3 other comparisons**, on other scenes, on an unseen stretch, for up to half an "
         "hour, each beside the best row without it: Instant-NGP is ahead in 1 of 1; Nerfacto is "
-        "ahead in 0 of 1, undecided in 1; Switch-NeRF is ahead in 0 of 1, of one seed in 1. It is "
-        "behind in none ([all of them](page.md#every-comparison-beside-the-best-row-without-it))."
+        "ahead in 0 of 1, undecided in 1; Switch-NeRF is ahead in 0 of 1, without a verdict in 1. "
+        "It is behind in none ([all of "
+        "them](page.md#every-comparison-beside-the-best-row-without-it))."
     )
     title, _, rows = comparisons.comparison_section(found)
     assert title.endswith("best row without it\n")
