@@ -1,7 +1,8 @@
-"""python training_on_a_card.py refusals|sampling|METHOD FOLDER, on a pretended card."""
+"""python training_on_a_card.py refusals | sampling, or leco-occupancy | hosts and a folder."""
 
 from __future__ import annotations
 
+import copy
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -64,9 +65,10 @@ def sampling() -> None:
         return estimator.sampling(where.origins, where.directions, **along, **options)
 
     asked = {"sigma_fn": lambda t_starts, t_ends, ray_indices: torch.ones_like(t_starts)}
+    here = LearnedOccupancyEstimator(copy.deepcopy(gate))
+    there = LearnedOccupancyEstimator(gate).to(CARD)
     for options in ({}, {"cone_angle": 0.01}, asked):
-        ours = kept(LearnedOccupancyEstimator(gate).to(CARD), placed, **options)
-        theirs = kept(LearnedOccupancyEstimator(gate.to("cpu")), rays, **options)
+        ours, theirs = kept(there, placed, **options), kept(here, rays, **options)
         assert all(part.device == torch.device(CARD) for part in ours)
         same = all(torch.equal(one.cpu(), other) for one, other in zip(ours, theirs))
         print("same" if same else "other samples")
@@ -122,20 +124,20 @@ def leco_occupancy(folder: Path) -> None:
     print(f"frozen, sharpened, resumed and rendered on {CARD}")
 
 
-def guided(name: str, folder: Path) -> None:
+def guided(name: str, scene: Path, runs: Path) -> None:
     """A host that learns its occupancy first."""
-    scene, learning = tiny_scene.write(folder / "scene"), "pipeline.model.occupancy.learning"
+    learning = "pipeline.model.occupancy.learning"
     flags = [*HOSTS[name], *QUICK, *sizes(LEARNING, learning), "--max-num-iterations=12"]
     config: Any = tyro.cli(
         tyro.conf.FlagConversionOff[TrainerConfig],
         default=discover_methods()[0][name],
         args=[*flags, "--pipeline.model.occupancy.rays=64"],
     )
-    config.output_dir = folder / "runs"
+    config.output_dir = runs
     trainer = trainer_of(config, scene)
     trainer.train()
     render(trainer)
-    print(f"guided and rendered on {CARD}")
+    print(f"{name} guided and rendered on {CARD}")
 
 
 def main() -> None:
@@ -147,7 +149,9 @@ def main() -> None:
         elif what == "leco-occupancy":
             leco_occupancy(Path(folder[0]))
         else:
-            guided(what, Path(folder[0]))
+            scene = tiny_scene.write(Path(folder[0]) / "scene")
+            for name in HOSTS:
+                guided(name, scene, Path(folder[0]))
 
 
 if __name__ == "__main__":
