@@ -134,12 +134,16 @@ class LearnedOccupancyEstimator(Estimator):
         return samples
 
     def _warn_of_rays_elsewhere(self, rays: Rays) -> bool:
-        """Warns where no ray of a batch comes near: they are in other coordinates then."""
+        """Warns where no ray of a batch comes near: they are in other coordinates then, or end
+        before they begin."""
         box = self.aabbs[0].to(rays.origins)
         enters, leaves = intersect_box(rays.origins, rays.directions, box)
         meets = enters.maximum(rays.t_mins) < leaves.minimum(rays.t_maxs)
         if len(meets) < RAYS_THAT_TELL or bool(meets.any()):
             return False
+        if bool((rays.t_mins >= rays.t_maxs).all()):
+            _log.warning("all of a batch of %d rays end before they begin", len(meets))
+            return True
         _log.warning(
             "none of a batch of %d rays comes near what this occupancy is of, %s: rays must be in "
             "the coordinates in which it was learned (`frame` in its report leads there)",

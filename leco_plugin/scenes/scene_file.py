@@ -134,7 +134,7 @@ def read_scene_file(path: Path, split: str, folder: Path) -> SceneFile:
     check_no_contradiction(poses, of_each)
     if split == "train" and np.ptp(poses[:, :3, 3], axis=0).max() == 0.0:
         number = "one image" if len(frames) == 1 else f"{len(frames)} images from one place"
-        raise InputError(f"{path} has {number}; a scene is seen from two places at least")
+        raise InputError(f"{path} has {number}: add photographs from two places at least")
     lenses = [lens_of(meta, frame, f"{path}: {frame['file_path']}") for frame in frames]
     check_together(lenses, str(path))
     masked = sum("mask_path" in frame for frame in frames)

@@ -346,6 +346,15 @@ def test_an_occupancy_in_double_precision_keeps_what_it_keeps_in_single():
     assert all(map(torch.equal, one, other))
 
 
+def test_rays_that_end_before_they_begin_are_told_as_such(caplog):
+    rays = camera_rays(40)
+    estimator = LearnedOccupancyEstimator(ball(), cache_bytes=0).train()
+    assert not len(estimator.sampling(*rays, near_plane=5.0, far_plane=4.0)[0])
+    assert [each.message for each in caplog.records] == [
+        "all of a batch of 40 rays end before they begin"
+    ]
+
+
 def test_rays_that_begin_behind_what_an_occupancy_is_of_are_named_too(caplog):
     origins, directions = camera_rays(40)
     for begin, said in ((0.0, 0), (4.0, 1)):

@@ -119,7 +119,7 @@ BAD_MEASURES: dict[str, tuple[Callable[[Path], object], str]] = {
     "a pose of another shape": (lambda s: change(s, set_pose([[1.0]])), "transforms.json"),
     "one image": (
         lambda s: change(s, lambda m: m.update(frames=m["frames"][:1])),
-        "has one image; a scene is seen from two places",
+        "has one image: add photographs from two places",
     ),
     "a panorama": (lambda s: change(s, stand_still), "has 9 images from one place"),
     "masks for some images": (
