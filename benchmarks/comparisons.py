@@ -16,11 +16,12 @@ from leco_plugin.chart.summary import RENDERING, Line, compare, describe_seeds, 
 
 SUITE = "enough-time"
 """The suite whose charts are among them: those of others compare gates."""
-TITLE = "Every comparison beside the best row without it"
-HEAD = """A method with a learned occupancy, beside the best of its other rows in equal time, one
-comparison for each stored chart; a *taught grid* learns its occupancy as the gate does. *Renders*
-says in how much less time than that row; *each seed ahead*, that each has more than each of its.
-Of an *unseen stretch* no neighbouring photograph is trained on.
+TITLE = "Every comparison with the best rival"
+HEAD = """A method with a learned occupancy and its best *rival*, in equal time, one comparison for
+each stored chart. Rivals are the other rows of the method whose gate, if they have one, is never
+frozen. A *taught grid* is none: it learns its occupancy as the gate does. *Renders* compares with
+the rival; *each seed ahead* says that each has more than each of the rival's. Of an *unseen
+stretch* no neighbouring photograph is trained on.
 """
 
 
@@ -61,28 +62,29 @@ def _of_chart(chart: str, results: Mapping[str, Any]) -> list[Comparison]:
 
 
 def in_words(found: Sequence[Comparison], table_is: str) -> str:
-    """How often each method is ahead of its best row without a learned occupancy."""
+    """How often methods are ahead of their best rival, all together and one by one."""
     hosts = dict.fromkeys(one.host for one in found)
     said = [f"{host} {_standing([one for one in found if one.host == host])}" for host in hosts]
     behind = sum(_verdict(one).word == "behind" for one in found)
     return (
-        f"**In {len(found)} other comparisons**, on other scenes, on an unseen stretch, for up to "
-        f"half an hour, each beside the best row without it: {'; '.join(said)}. It is "
-        f"behind in {behind or 'none'} ([all of them]({table_is}#{heading_anchor(TITLE)}))."
+        f"**In {len(found)} other comparisons** with the best rival (more scenes, an unseen "
+        f"stretch, up to half an hour) a learned occupancy is {_standing(found)}, behind in "
+        f"{behind or 'none'}. By method: {'; '.join(said)} "
+        f"([all of them]({table_is}#{heading_anchor(TITLE)}))."
     )
 
 
 def _standing(found: Sequence[Comparison]) -> str:
-    """Such as "is ahead in 2 of 6, undecided in 3, without a verdict in 1"."""
+    """Such as "ahead in 2 of 6, undecided in 3, without a verdict in 1"."""
     counts = Counter(_verdict(one).word for one in found)
     rest = [f"{word} in {counts[word]}" for word in ("level", "undecided") if counts[word]]
     rest += [f"without a verdict in {counts[None]}"] if counts[None] else []
-    return ", ".join([f"is ahead in {counts['ahead']} of {len(found)}", *rest])
+    return ", ".join([f"ahead in {counts['ahead']} of {len(found)}", *rest])
 
 
 def comparison_section(found: Sequence[Comparison]) -> list[str]:
     """All of them, for the page of measurements."""
-    columns = "method, scene, time, seeds | learned | best without it | learned is | renders | "
+    columns = "method, scene, time, seeds | learned | best rival | learned is | renders | "
     return [
         f"## {TITLE}\n",
         HEAD,

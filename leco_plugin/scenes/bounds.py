@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from leco_plugin.scenes.input_error import InputError
@@ -133,6 +132,8 @@ def usable_points(points: Tensor | None) -> Tensor | None:
 def _without_strays(points: Tensor, poses: Tensor | None) -> tuple[Tensor, str]:
     """Those of finite points [P, 3] that are not far from all others, also over the distance to the
     nearest of poses [C, 3, 4] if given; and words on the rest, none if there is no rest."""
+    from scipy.spatial import KDTree  # only here: a suite on a GPU has torch alone
+
     places = points.numpy()
     some = places[:: -(-len(places) // CLOUD)]
     gaps = torch.from_numpy(KDTree(some).query(places, k=min(9, len(some)))[0][:, -1])

@@ -110,7 +110,7 @@ def read_cloud(path: Path) -> PointCloud:
 
     try:
         if is_pointer(path):
-            raise ValueError(f"it {FETCH}")
+            raise InputError(f"{path} cannot be read as sparse points: it {FETCH}")
         # as a file and not by its name: nothing else is read that it may point to
         with path.open("rb") as file:
             loaded: Any = trimesh.load(file, file_type="ply", process=False)
@@ -124,6 +124,8 @@ def read_cloud(path: Path) -> PointCloud:
         is_mesh = getattr(getattr(loaded, "visual", None), "kind", None) == "vertex"
         paint = loaded.visual.vertex_colors if is_mesh else getattr(loaded, "colors", ())
         colours = np.asarray(paint, dtype=np.uint8)
+    except InputError:
+        raise
     except Exception as error:  # noqa: BLE001  trimesh raises whatever its parsers meet
         why = one_line(error, 120)
         fault = f"{path} cannot be read as sparse points ({why})"
