@@ -11,9 +11,11 @@ import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from leco_plugin.log import counted
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.space import NO_WALL, SpaceKind
 
@@ -38,13 +40,17 @@ MOST_POINTS = 100_000
 """Of which it is told whether a camera sees any."""
 FEWEST_POINTS = 32
 """Fewer sparse points say nothing of a scene."""
-STRAY, STRAY_SEEN, CLOUD = 25.0, 0.3, 100_000
+STRAY, STRAY_SEEN, FEW_STRAYS = 25.0, 0.3, 0.02
 """Distance of a point to its eighth neighbour, over that of most points, from which on it is a
 mistake of the reconstruction: in real scenes without mistakes 23 at most. Of what is not seen from
 above, where points lie wider apart with their distance, that is also over their distance to the
-nearest camera. Neighbours are among so many points at most."""
-FAR_CAMERA = 20.0
-"""Distance of a camera from the middle, over that of half of them, from which on it is far."""
+nearest camera. A larger share of points is no mistake: most then lie close on a part of the scene.
+"""
+CLOUD = 100_000
+"""Sparse points, evenly of all, that bound a scene."""
+FAR_CAMERA, NEARER = 20.0, 0.75
+"""Distance of a camera from the middle, over that within which this share of them lies, from which
+on it is far. Half of them may lie at one place, as of a panorama."""
 OVER_CAMERAS = 0.06
 """Share of the way from the ground to the highest camera by which raised bounds end above it."""
 NEAR_CAMERAS = 0.04
@@ -99,8 +105,8 @@ def find_bounds(
             raise InputError(f"{lack}: {remedy}")
         return _without_points(poses, directions)
     from_above, seen = _seen_from_above(poses, directions, points)
+    count = len(points)
     points, left_out = _without_strays(points, None if from_above else poses)
-    seen += left_out
     low, high = _quantiles(points, 0.001), _quantiles(points, 0.999)
     near, far = _range(_depths(poses, directions, points))
     if from_above and config.space != "contraction":
@@ -110,13 +116,15 @@ def find_bounds(
         top = float(high[2]) + 0.3 * relief
         why = f"photographed from above ({seen}): bounded"
         found = _slab(poses, directions, (ground, top), (near, far), why)
-        return replace(found, lowest=float(low[2]))
-    if config.space == "box":
-        return _room(poses, low, high, near, far)
-    half = float((high - low).max()) / 2
-    why = "as configured" if config.space == "contraction" else f"not from above ({seen})"
-    reason = f"{why}: contracted outside {half:.3f} around {len(points)} sparse points"
-    return SceneBounds("contraction", (low + high) / 2, half, near, far, _no_walls(), reason)
+        found = replace(found, lowest=float(low[2]))
+    elif config.space == "box":
+        found = _room(poses, low, high, near, far)
+    else:
+        half = float((high - low).max()) / 2
+        why = "as configured" if config.space == "contraction" else f"not from above ({seen})"
+        why += f": contracted outside {half:.3f} around {count} sparse points"
+        found = SceneBounds("contraction", (low + high) / 2, half, near, far, _no_walls(), why)
+    return replace(found, reason=found.reason + left_out)
 
 
 def usable_points(points: Tensor | None) -> Tensor | None:
@@ -130,27 +138,31 @@ def usable_points(points: Tensor | None) -> Tensor | None:
 
 
 def _without_strays(points: Tensor, poses: Tensor | None) -> tuple[Tensor, str]:
-    """Those of finite points [P, 3] that are not far from all others, also over the distance to the
-    nearest of poses [C, 3, 4] if given; and words on the rest, none if there is no rest."""
+    """Up to `CLOUD` of finite points [P, 3] without the few that are far from all others, also over
+    the distance to the nearest of poses [C, 3, 4] if given; and words on these, if there are any.
+    """
     from scipy.spatial import KDTree  # only here: a suite on a GPU has torch alone
 
-    places = points.numpy()
-    some = places[:: -(-len(places) // CLOUD)]
-    gaps = torch.from_numpy(KDTree(some).query(places, k=min(9, len(some)))[0][:, -1])
-    usual = float(gaps.median())
-    strays = gaps > STRAY * usual
+    step = -(-len(points) // CLOUD)
+    points = points[::step]
+    places, which = np.unique(points.numpy(), axis=0, return_inverse=True)  # thousands may be 0
+    gaps = KDTree(places).query(places, k=[min(9, len(places))])[0][:, 0]
+    strays = gaps > STRAY * np.median(gaps)
     if poses is not None:
-        away = torch.from_numpy(KDTree(poses[:, :, 3].numpy()).query(places)[0])
-        strays &= gaps > STRAY_SEEN * away
-    if usual <= 0.0 or not bool(strays.any()):
+        strays &= gaps > STRAY_SEEN * KDTree(poses[:, :, 3].numpy()).query(places)[0]
+    if not 0.0 < strays.mean() <= FEW_STRAYS:
         return points, ""
-    return points[~strays], f", {int(strays.sum())} sparse points far from all others are left out"
+    left = torch.from_numpy(~strays[which.reshape(-1)])
+    far = " far from all others"
+    said = counted(step * int((~left).sum()), f"sparse point{far} is", f"sparse points{far} are")
+    return points[left], f"; {said} left out"
 
 
 def distances_from_middle(places: Tensor) -> Tensor:
-    """Distances [C] of cameras at places [C, 3] from their middle, over that of half of them."""
+    """Distances [C] of cameras at places [C, 3] from their middle, over that within which most lie;
+    0 if most lie at one place."""
     away = (places - places.median(dim=0).values).norm(dim=-1)
-    return away / away.median().clamp(min=1e-12)
+    return (away / away.quantile(NEARER)).nan_to_num(0.0, posinf=0.0)
 
 
 def with_range(bounds: SceneBounds, near: float | None, far: float | None) -> SceneBounds:
@@ -291,8 +303,11 @@ def blind_cameras(camera_to_worlds: Tensor, directions: Tensor, points: Tensor |
     if points is None:
         return []
     poses, directions = (part.detach().float().cpu() for part in (camera_to_worlds, directions))
-    depths = _depths_of_each(poses, directions, points, MOST_POINTS)
-    return [number for number, seen in enumerate(depths) if not len(seen)]
+    blind = list(range(len(poses)))
+    for most in (2000, MOST_POINTS):  # nearly all see one of the few
+        depths = _depths_of_each(poses[blind], directions[blind], points, most)
+        blind = [number for number, seen in zip(blind, depths) if not len(seen)]
+    return blind
 
 
 MOSTLY_ABOVE, MOSTLY_DOWN = 0.75, 0.9

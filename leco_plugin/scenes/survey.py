@@ -213,7 +213,7 @@ def doubtful_cameras(dataset: Any) -> list[str]:
     times = distances_from_middle(poses[:, :3, 3].double().cpu())
     far = (times > FAR_CAMERA).nonzero().flatten().tolist()
     if far:
-        most = f"up to {float(times.max()):.0f} times as far from the middle as half of the cameras"
+        most = f"up to {float(times.max()):.0f} times as far from the middle as most cameras"
         why = "the others share a small part of the scene"
         lines.append(f"photographed from {most}: {_named(dataset, far)}; {why}")
     chosen, (_, directions) = chosen_cameras(len(poses)), covering_rays(dataset.cameras)

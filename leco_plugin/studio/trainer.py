@@ -74,7 +74,8 @@ def _trackers_in_one_line(vis: str) -> Iterator[None]:
         yield
     except Exception as error:
         calls = traceback.extract_tb(error.__traceback__)
-        if not any(call.name == "setup_event_writer" for call in calls):
+        is_tracked = "wandb" in vis or "comet" in vis
+        if not is_tracked or all(call.name != "setup_event_writer" for call in calls):
             raise
         fault = f"--vis {vis} cannot begin ({one_line(error, 120)})"
         raise InputError(f"{fault}: log in there, or give --vis tensorboard") from error

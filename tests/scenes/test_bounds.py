@@ -9,7 +9,13 @@ from tiny_scene import camera_to_world
 from torch import Tensor
 
 from leco_plugin.samplers.boxes import intersect_box
-from leco_plugin.scenes.bounds import BoundsConfig, SceneBounds, find_bounds, with_range
+from leco_plugin.scenes.bounds import (
+    BoundsConfig,
+    SceneBounds,
+    distances_from_middle,
+    find_bounds,
+    with_range,
+)
 
 
 def image_rays(poses: Tensor) -> Tensor:
@@ -96,6 +102,38 @@ def test_a_few_points_far_from_all_others_do_not_widen_the_bounds(make) -> None:
     assert bounds.half_extent == pytest.approx(usual.half_extent, rel=0.05)
     assert "20 sparse points far from all others are left out" in bounds.reason
     assert "left out" not in usual.reason
+
+
+@pytest.mark.parametrize("space", ["box", "contraction"])
+def test_points_that_are_left_out_are_told_whatever_is_configured(space) -> None:
+    poses, directions, points = around()
+    stray = torch.full((1, 3), 200.0)
+    bounds = find_bounds(poses, directions, torch.cat([points, stray]), BoundsConfig(space=space))
+    assert bounds.reason.endswith("; 1 sparse point far from all others is left out")
+
+
+def test_a_survey_around_one_dense_building_is_no_stray() -> None:
+    poses, directions, points = from_above()
+    building = torch.cat([points * 0.01 + shift for shift in torch.linspace(0.0, 0.4, 10)])
+    bounds = find_bounds(poses, directions, torch.cat([points, building]))
+    usual = find_bounds(poses, directions, points)
+    torch.testing.assert_close(bounds.aabb, usual.aabb, rtol=0.05, atol=0.05)
+
+
+def test_points_at_one_place_are_one_and_strays_are_found_in_a_large_cloud() -> None:
+    """Half a million points that are alike took minutes."""
+    poses, directions, points = from_above()
+    nothing = torch.full((500_000, 3), -300.0)
+    bounds = find_bounds(poses, directions, torch.cat([points.repeat(500, 1), nothing]))
+    assert bounds.far < 40.0 and float(bounds.aabb[2]) > -10.0
+    assert "sparse points far from all others are left out" in bounds.reason
+
+
+@pytest.mark.parametrize("at_one", [12, 19])
+def test_two_standpoints_are_not_far_from_each_other(at_one: int) -> None:
+    places = torch.zeros(20, 3).double()
+    places[at_one:, 0] = 5.0
+    assert float(distances_from_middle(places).max()) <= 1.0
 
 
 def test_a_sparse_background_is_no_stray() -> None:

@@ -173,7 +173,7 @@ def test_photographs_far_off_or_without_a_point_in_view_are_named_once(far: bool
     blind = "3.png" if far else "3.png, 4.png"
     assert away.startswith(f"in view of no sparse point: {blind}; the bounds become as wide as")
     assert len(of_far) == far
-    assert all("as half of the cameras: 4.png; the others share" in line for line in of_far)
+    assert all("as most cameras: 4.png; the others share" in line for line in of_far)
     assert away.endswith("; if their poses are wrong, leave their frames out or mend them")
 
 

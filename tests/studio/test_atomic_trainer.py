@@ -279,5 +279,7 @@ def test_a_tracker_that_cannot_begin_is_one_line_and_other_errors_stay() -> None
         _trackers_in_one_line("wandb"),
     ):
         setup_event_writer()
+    with pytest.raises(ValueError, match="no key"), _trackers_in_one_line("tensorboard"):
+        setup_event_writer()
     with pytest.raises(ValueError, match="another"), _trackers_in_one_line("wandb"):
         raise ValueError("another")

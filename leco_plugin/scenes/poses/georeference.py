@@ -138,13 +138,14 @@ def _place_on_the_level(centres: Array, gps: Array, up: Array) -> Placement | No
     upright_turn = _by_direction(up, "").turn
     seen = centres[there] @ upright_turn.T
     source, target = seen[:, 0] + 1j * seen[:, 1], gps[there, 0] + 1j * gps[there, 1]
-    width = tolerance(float(np.sqrt((np.abs(target - target.mean()) ** 2).mean())))
+    width = tolerance(_spread(gps[there, :2]))
     rng, best = np.random.default_rng(0), np.zeros(len(source), dtype=bool)
     for one, other in rng.integers(0, len(source), size=(TRIALS, 2)):
         if width > 0.0 and source[one] != source[other]:
             factor = (target[one] - target[other]) / (source[one] - source[other])
             off = np.abs(factor * (source - source[one]) + target[one] - target)
             best = max(best, off <= width, key=np.sum)
+    best = _apart(gps[there, :2], best, width)
     if best.sum() - ALWAYS < AGREEING * (len(source) - ALWAYS):
         return None
     from_middle, to_middle = source[best] - source[best].mean(), target[best] - target[best].mean()
@@ -168,21 +169,22 @@ def _place_in_space(
         have = by_number(count, "photograph has", "photographs have")
         few = f"{count or 'no'} placed {have} a GPS position"
         return _by_direction(up, f"{few}, and {FEWEST} are needed")
-    spread = float(np.sqrt(((known - known.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    spread = _spread(known)
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed = tolerance(spread), 0
     found: Any = None
     if options.max_error > 0.0:  # else all positions are the same
         found = pycolmap.estimate_sim3d_robust(centres[there], known, options)
-    agreeing = 0 if found is None else int(np.sum(found["inlier_mask"]))
-    if agreeing - ALWAYS < AGREEING * (count - ALWAYS):
-        within = f"{agreeing} of {count} positions agree within {options.max_error:.1f} m"
+    inlier = np.zeros(count, dtype=bool) if found is None else np.asarray(found["inlier_mask"])
+    inlier = _apart(known, inlier, options.max_error)
+    if inlier.sum() - ALWAYS < AGREEING * (count - ALWAYS):
+        within = f"{inlier.sum()} of {count} positions agree within {options.max_error:.1f} m"
         reason = f"GPS contradicts the poses: {within}; mend EXIF, or"
         if spread < TOLERANCE:
             near = f"the positions by GPS lie {spread:.1f} m apart"
             reason = f"{near}, too near for what GPS is off by;"
         return _by_direction(up, f"{reason} set metres_per_unit in transforms.json")
-    matrix, inlier = found["tgt_from_src"].matrix(), np.asarray(found["inlier_mask"], dtype=bool)
+    matrix = found["tgt_from_src"].matrix()
     scale, places = float(np.linalg.det(matrix[:, :3])) ** (1.0 / 3.0), known[inlier]
     turn = roll_upright(matrix[:, :3] / scale, places, up, options.max_error)
     if _is_mirrored(turn, places, up, top, options.max_error):
@@ -191,6 +193,17 @@ def _place_in_space(
     shift = places.mean(axis=0) - scale * turn @ centres[there][inlier].mean(axis=0)
     placed = Placement(scale, turn, shift)
     return replace(placed, residuals=np.linalg.norm(placed.apply(centres) - gps, axis=1))
+
+
+def _spread(places: Array) -> float:
+    """Distance [m] of places [N, 2 or 3] from their middle, root mean square."""
+    return float(np.sqrt(((places - places.mean(axis=0)) ** 2).sum(axis=1).mean()))
+
+
+def _apart(places: Array, agreeing: NDArray[np.bool_], width: float) -> NDArray[np.bool_]:
+    """Which of places [N, 2 or 3] agree with the poses within `width` metres; none where they all
+    lie at one place, as of a receiver that repeats its last: those fit any poses of no size."""
+    return agreeing & bool(agreeing.any() and _spread(places[agreeing]) > width)
 
 
 def _is_mirrored(turn: Array, places: Array, up: Array, top: Array | None, width: float) -> bool:

@@ -142,6 +142,18 @@ def test_wrong_altitudes_neither_tilt_a_survey_nor_cost_it_its_metres(kind: str)
     np.testing.assert_allclose(placed.apply(centres)[:, :2], places[:, :2], atol=3.0)
 
 
+@pytest.mark.parametrize("scatter", [0.0, 1.0])
+def test_a_receiver_that_repeats_one_place_does_not_make_a_survey_small(scatter: float) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    places = survey(1)[0][:, :, 3]
+    centres, up = away(places)
+    gps = places.copy()
+    gps[:18] = gps[0] + scatter * np.random.default_rng(0).normal(size=(18, 3))
+    placed = place(pycolmap, centres, gps, up)
+    assert placed.residuals is None and placed.scale == 1.0
+    assert "GPS contradicts the poses" in placed.reason
+
+
 def test_on_a_slope_gps_says_what_is_up() -> None:
     pycolmap = pytest.importorskip("pycolmap")
     poses, _ = survey(1)
