@@ -24,7 +24,7 @@ from leco_plugin.models.front_to_back import (
     shade_in_torch,
     suits_native,
 )
-from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.models.gate import Gate, GateConfig, occupancy_from_logits
 from leco_plugin.models.hmoe import HMoEConfig
 from leco_plugin.models.rendering import (
     Answers,
@@ -225,8 +225,17 @@ def test_c_asks_and_answers_as_torch_does(
     monkeypatch.setenv(VARIABLE, "native")
     theirs, expected = shade_front_to_back(*given)
     assert {0, 1} <= set(ours.routes.tolist()) <= {0, 1, 3}
+    best = ours.logits[:, 1:].topk(2).values
+    # between equal experts, and at the threshold, rounding chooses
+    tied = (best[:, 0] - best[:, 1] < 1e-4) | (
+        (occupancy_from_logits(ours.logits) - middle).abs() < 1e-5
+    )
+    clear = torch.ones(150, dtype=torch.bool)
+    clear[asked[0][tied]] = False
+    assert clear.sum() > 140
     for one, other in zip((*asked, *ours), (*expected, *theirs), strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+        chosen = clear if len(one) == len(clear) else clear[asked[0]]
+        torch.testing.assert_close(one[chosen], other[chosen], rtol=1e-4, atol=1e-5)
 
 
 @needs_compiler
