@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from leco_plugin.log import counted
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.space import NO_WALL, SpaceKind
 
@@ -153,9 +152,9 @@ def _without_strays(points: Tensor, poses: Tensor | None) -> tuple[Tensor, str]:
     if not 0.0 < strays.mean() <= FEW_STRAYS:
         return points, ""
     left = torch.from_numpy(~strays[which.reshape(-1)])
-    far = " far from all others"
-    said = counted(step * int((~left).sum()), f"sparse point{far} is", f"sparse points{far} are")
-    return points[left], f"; {said} left out"
+    count = step * int((~left).sum())
+    what = "point far from all others is" if count == 1 else "points far from all others are"
+    return points[left], f"; {count} sparse {what} left out"
 
 
 def distances_from_middle(places: Tensor) -> Tensor:
