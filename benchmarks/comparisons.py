@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import statistics
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -12,7 +12,14 @@ from chart_sections import star, stored, titles
 from page_parts import heading_anchor, table
 
 from leco_plugin.chart.contender import LEARNED
-from leco_plugin.chart.summary import RENDERING, Line, compare, describe_seeds, lines_of
+from leco_plugin.chart.summary import (
+    RENDERING,
+    Line,
+    Verdict,
+    compare,
+    describe_seeds,
+    lines_of,
+)
 
 SUITE = "enough-time"
 """The suite whose charts are among them: those of others compare gates."""
@@ -29,6 +36,8 @@ class Comparison(NamedTuple):
     """Rows of one method in a stored chart."""
 
     chart: str
+    title: str
+    results: Mapping[str, Any]
     host: str
     ours: Line
     """That with our learned occupancy."""
@@ -37,19 +46,24 @@ class Comparison(NamedTuple):
     others: list[Line]
     """Those that learned none, the best first."""
 
+    @property
+    def verdict(self) -> Verdict:
+        """How ours stands beside the best of those that learned none."""
+        return compare(self.ours.psnrs, self.others[0].psnrs)
+
 
 def comparisons(apart: Sequence[str]) -> list[Comparison]:
     """Of all stored charts but some that are shown apart, method by method."""
     found = []
-    for chart in titles():
+    for chart, title in titles().items():
         results = stored(chart)
         if chart not in apart and results["suite"] in (None, SUITE):
-            found += _of_chart(chart, results)
+            found += _of_chart(chart, title, results)
     hosts = list(dict.fromkeys(one.host for one in found))
     return sorted(found, key=lambda one: hosts.index(one.host))
 
 
-def _of_chart(chart: str, results: Mapping[str, Any]) -> list[Comparison]:
+def _of_chart(chart: str, title: str, results: Mapping[str, Any]) -> list[Comparison]:
     lines, found = lines_of(results), []
     for ours in (line for line in lines if line.sampler == LEARNED):
         rest = [line for line in lines if line.method == ours.method and line is not ours]
@@ -57,7 +71,7 @@ def _of_chart(chart: str, results: Mapping[str, Any]) -> list[Comparison]:
         taught = [line for line in rest if line.learned]
         host = str(ours.runs[0]["name"]).split(" + ")[0]
         others = [line for line in rest if not line.learned]
-        found.append(Comparison(chart, host, ours, taught, others))
+        found.append(Comparison(chart, title, results, host, ours, taught, others))
     return found
 
 
@@ -65,7 +79,7 @@ def in_words(found: Sequence[Comparison], table_is: str) -> str:
     """How often methods are ahead of their best rival, all together and one by one."""
     hosts = dict.fromkeys(one.host for one in found)
     said = [f"{host} {_standing([one for one in found if one.host == host])}" for host in hosts]
-    behind = sum(_verdict(one).word == "behind" for one in found)
+    behind = sum(one.verdict.word == "behind" for one in found)
     return (
         f"**In {len(found)} other comparisons** with the best rival (more scenes, an unseen "
         f"stretch, up to half an hour) a learned occupancy is {_standing(found)}, behind in "
@@ -76,7 +90,7 @@ def in_words(found: Sequence[Comparison], table_is: str) -> str:
 
 def _standing(found: Sequence[Comparison]) -> str:
     """Such as "ahead in 2 of 6, undecided in 3, without a verdict in 1"."""
-    counts = Counter(_verdict(one).word for one in found)
+    counts = Counter(one.verdict.word for one in found)
     rest = [f"{word} in {counts[word]}" for word in ("level", "undecided") if counts[word]]
     rest += [f"without a verdict in {counts[None]}"] if counts[None] else []
     return ", ".join([f"ahead in {counts['ahead']} of {len(found)}", *rest])
@@ -93,8 +107,7 @@ def comparison_section(found: Sequence[Comparison]) -> list[str]:
 
 
 def _row(one: Comparison) -> list[str]:
-    results, title = stored(one.chart), titles()[one.chart]
-    page = "suites.md" if results["suite"] else ""
+    results, page = one.results, "suites.md" if one.results["suite"] else ""
     what = f"{one.host}, `{results['scene']['name']}`"
     if results.get("held_out", {}).get("test"):
         what += ", unseen stretch"
@@ -102,7 +115,7 @@ def _row(one: Comparison) -> list[str]:
     best = one.others[0]
     clear = min(len(best.runs), len(one.ours.runs)) > 1 and min(one.ours.psnrs) > max(best.psnrs)
     return [
-        f"[{where}]({page}#{heading_anchor(title)}){star(one.chart)}",
+        f"[{where}]({page}#{heading_anchor(one.title)}){star(one.chart)}",
         f"{one.ours.psnr:.1f} dB",
         f"{best.psnr:.1f} dB, {called(best, one.host)}",
         beside(one.ours, best) + (", each seed ahead" if clear else ""),
@@ -131,11 +144,5 @@ def beside(ours: Line, other: Line) -> str:
 
 def faster(ours: Line, other: Line) -> str:
     """How ours renders an image beside another row."""
-    times = statistics.median(run[RENDERING.key] for run in other.runs) / statistics.median(
-        run[RENDERING.key] for run in ours.runs
-    )
+    times = (other.median(RENDERING) or math.nan) / (ours.median(RENDERING) or math.nan)
     return f"{times:.1f} x as fast" if times >= 1.0 else f"in {1.0 / times:.1f} x the time"
-
-
-def _verdict(one: Comparison) -> Any:
-    return compare(one.ours.psnrs, one.others[0].psnrs)
