@@ -220,6 +220,12 @@ def counted(count: int, one: str, many: str | None = None) -> str:
     return f"{count} {by_number(count, one, many or f'{one}s')}"
 
 
+def first_of(names: Sequence[str], most: int = 5, rest: str = "more") -> str:
+    """Up to so many names of a list, and how many more there are, in words."""
+    left = len(names) - most
+    return ", ".join(names[:most]) + (f" and {left} {rest}" if left > 0 else "")
+
+
 @contextmanager
 def resumable() -> Iterator[None]:
     """A context for resumable work: Ctrl-C says that finished parts are kept."""

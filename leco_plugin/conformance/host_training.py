@@ -30,6 +30,7 @@ from leco_plugin.conformance.hosts import (
 from leco_plugin.conformance.rules import checks, require
 from leco_plugin.conformance.samplers import on_two_ranks, reloaded
 from leco_plugin.conformance.scene import CENTRE, HALF, SLAB
+from leco_plugin.log import first_of
 
 if TYPE_CHECKING:
     from nerfstudio.engine.callbacks import TrainingCallbackLocation
@@ -70,7 +71,7 @@ def teaches_the_host_alone(case: HostCase) -> None:
         require(not parameter.requires_grad, f"{name} of the guide is no longer frozen")
         require(id(parameter) not in handed_out, f"{name} of the guide is handed to an optimizer")
     touched = [name for name in gradients if name.startswith(GUIDE)]
-    require(not touched, f"{_some(touched)} of the guide get a gradient")
+    require(not touched, f"{first_of(touched, 3)} of the guide get a gradient")
 
 
 def gradients_of_a_step(model: Model) -> dict[str, Tensor]:
@@ -98,22 +99,18 @@ def nothing_superfluous_is_left(case: HostCase) -> None:
     idle = before.keys() & now.keys() - gradients_of_a_step(model).keys()
     require(
         not idle,
-        f"{_some(sorted(idle))} are trained with the host's own sampler, and get no gradient now",
+        f"{first_of(sorted(idle), 3)} are trained with the host's own sampler, and get no gradient "
+        "now",
     )
     state = model.state_dict().keys()
     gained = state - own.state_dict().keys()
     more = sorted(name for name in gained if not name.startswith(GUIDE))
-    require(not more, f"the state dict has gained {_some(more)} beside the guide")
+    require(not more, f"the state dict has gained {first_of(more, 3)} beside the guide")
     held = {id(parameter) for parameter in now.values()}
     for name, group in model.get_param_groups().items():
         require(bool(group), f"the parameter group {name!r} is empty, which no optimizer takes")
         gone = sum(id(parameter) not in held for parameter in group)
         require(gone == 0, f"the parameter group {name!r} holds {gone} that the host no longer has")
-
-
-def _some(names: list[str]) -> str:
-    shown = ", ".join(names[:3])
-    return shown if len(names) <= 3 else f"{shown} and {len(names) - 3} more"
 
 
 ROUNDING = 1e-3

@@ -12,7 +12,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from leco_plugin.log import summarize
+from leco_plugin.log import first_of, summarize
 from leco_plugin.models.objective import DARK
 from leco_plugin.samplers.boxes import intersect_box
 from leco_plugin.scenes.bounds import (
@@ -35,8 +35,6 @@ SIDE = 8
 MOST_CAMERAS = 256
 WORTH_IT = 0.005
 """Share of all rays that must show something beyond a survey from the air, to raise its bounds."""
-NAMED = 5
-"""Photographs that are named in a line."""
 MOST_PICTURES = 16
 """Pictures that are opened to see what lies beyond: those with the most rays that miss."""
 
@@ -226,9 +224,7 @@ def doubtful_cameras(dataset: Any) -> list[str]:
 
 
 def _named(dataset: Any, numbers: Sequence[int]) -> str:
-    """Some photographs of a dataset, the first of them by name."""
-    named = ", ".join(Path(dataset.image_filenames[number]).name for number in numbers[:NAMED])
-    return named + (f" and {len(numbers) - NAMED} more" if len(numbers) > NAMED else "")
+    return first_of([Path(dataset.image_filenames[number]).name for number in numbers])
 
 
 def seen_beyond(dataset: Any, numbers: Tensor, misses: Tensor) -> float:

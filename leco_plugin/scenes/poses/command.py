@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from leco_plugin.log import resumable
+from leco_plugin.log import first_of, resumable
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.poses import ASKED
 from leco_plugin.scenes.poses import georeference as world
@@ -261,5 +261,4 @@ def summary(report: dict[str, Any]) -> list[str]:
 
 
 def _some(names: list[str]) -> str:
-    more = f" and {len(names) - NAMED} more ({REPORT} has all)" if len(names) > NAMED else ""
-    return ", ".join(names[:NAMED]) + more
+    return first_of(names, NAMED, f"more ({REPORT} has all)")
