@@ -36,8 +36,7 @@ DISTORTION = ("k1", "k2", "p1", "p2")
 ACROSS, DOWN = 32, 24
 """Rays of a picture that its camera is fitted to."""
 LENSES = 16
-"""Pictures of a camera to which a lens is fitted. That of the best is kept: a car that turns while
-a picture is read out bends its rays."""
+"""Pictures of a camera to which a lens is fitted, the best of which is kept: turning bends rays."""
 STRAIGHT = 0.1
 """Pixels (root mean square) within which a lens is fitted without distortion."""
 NO_CAMERA = 0.05
@@ -57,9 +56,8 @@ there at most, and directions of length 1 of the rays of ACROSS x DOWN of its pi
 
 
 def make_scene(records: Path, out: Path) -> dict[str, Any]:
-    """Writes pictures and cameras of a folder of records; returns what was fitted. A picture that
-    stands twice counts once, for testing if one of the two is. Goes on with what a killed run has
-    left. InputError for other files, or an `out` with a scene."""
+    """Makes a scene of records; returns what was fitted. A picture that stands twice counts once,
+    for testing if either does. InputError for other files, or an `out` with a scene."""
     require_folder(records, "give that of the records, *.tfrecord*")
     files = sorted(path for path in records.rglob("*.tfrecord*") if path.is_file())
     if all("validation" in path.name for path in files):
@@ -130,8 +128,7 @@ def _write_scene(out: Path, pictures: NDArray[Any]) -> dict[str, Any]:
 
 
 def best_lens(pictures: NDArray[Any]) -> dict[str, float]:
-    """The lens of a camera, as transforms.json has it: of those that are fitted to some of its
-    pictures, that with the least error. InputError if none comes near."""
+    """The best lens of a camera, as transforms.json has it. InputError if none comes near."""
     some = np.unique(np.linspace(0, len(pictures) - 1, LENSES).astype(int))
     lens, error = min((fit_lens(pictures[each]) for each in some), key=lambda found: found[1])
     fault = ""
@@ -198,8 +195,7 @@ def _pixels(width: int, height: int) -> Array:
 
 
 def _seen(directions: Array, turn: Array, intrinsics: Array, distortion: Array) -> Array:
-    """Pixels [R, 2] in which a camera has directions [R, 3] of the world, by the rotation vector
-    that leads to its axes: right, down, forward, as OpenCV's."""
+    """Pixels [R, 2] of world directions [R, 3]; `turn` is the rotation vector to OpenCV's axes."""
     fx, fy, cx, cy = intrinsics
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     seen = cv2.projectPoints(directions, turn, np.zeros(3), matrix, distortion)[0]
@@ -223,8 +219,7 @@ def _apart(offsets: Array) -> float:
 
 
 def _read(path: Path, out: Path) -> Iterator[tuple[Any, ...]]:
-    """Writes the pictures of a file; yields a row of `RAYS` for each. InputError for a file that
-    holds something else."""
+    """Writes a file's pictures; yields a row of `RAYS` for each. InputError for another file."""
     try:
         with gzip.open(path) as file:
             while head := file.read(12):  # the length, and a sum of it: gzip has its own
@@ -280,8 +275,7 @@ def _picture(fields: dict[str, list[memoryview]]) -> tuple[Any, ...]:
 
 
 def _fields(record: bytes) -> dict[str, list[memoryview]]:
-    """The fields of a tf.train.Example, whose class only tensorflow brings: bytes, or numbers,
-    which are packed, as bytes."""
+    """Fields of a tf.train.Example, whose class only tensorflow brings; numbers stay packed."""
     found = {}
     for _, features in _parts(memoryview(record)):
         for _, entry in _parts(features):
@@ -292,8 +286,7 @@ def _fields(record: bytes) -> dict[str, list[memoryview]]:
 
 
 def _parts(message: memoryview) -> Iterator[tuple[int, memoryview]]:
-    """Number and content of each field of a message of protobuf, all of which have a length here.
-    ValueError for one that has none, or is cut off."""
+    """Number and content of a protobuf message's fields. ValueError for one without a length."""
     at = 0
     while at < len(message):
         key, at = _varint(message, at)

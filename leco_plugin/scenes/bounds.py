@@ -41,10 +41,8 @@ FEWEST_POINTS = 32
 """Fewer sparse points say nothing of a scene."""
 STRAY, STRAY_SEEN, FEW_STRAYS = 25.0, 0.3, 0.02
 """Distance of a point to its eighth neighbour, over that of most points, from which on it is a
-mistake of the reconstruction: in real scenes without mistakes 23 at most. Of what is not seen from
-above, where points lie wider apart with their distance, that is also over their distance to the
-nearest camera. A larger share of points is no mistake: most then lie close on a part of the scene.
-"""
+mistake: real scenes without any have 23 at most. Of what is not seen from above it is also over the
+distance to the nearest camera. A larger share of points is a part of the scene."""
 CLOUD = 100_000
 """Sparse points, evenly of all, that bound a scene."""
 FAR_CAMERA, NEARER = 20.0, 0.75
@@ -127,8 +125,7 @@ def find_bounds(
 
 
 def usable_points(points: Tensor | None) -> Tensor | None:
-    """The finite ones of sparse points [P, 3], float32 on the CPU; None if they are fewer than
-    `FEWEST_POINTS`."""
+    """The finite ones of points [P, 3], float32 on the CPU; None of fewer than `FEWEST_POINTS`."""
     if points is None:
         return None
     points = points.detach().float().cpu()
@@ -137,9 +134,8 @@ def usable_points(points: Tensor | None) -> Tensor | None:
 
 
 def _without_strays(points: Tensor, poses: Tensor | None) -> tuple[Tensor, str]:
-    """Up to `CLOUD` of finite points [P, 3] without the few that are far from all others, also over
-    the distance to the nearest of poses [C, 3, 4] if given; and words on these, if there are any.
-    """
+    """Up to `CLOUD` of finite points [P, 3] without the few far from all others, also over the
+    distance to the nearest of poses [C, 3, 4] if given; and words on these."""
     from scipy.spatial import KDTree  # only here: a suite on a GPU has torch alone
 
     step = -(-len(points) // CLOUD)
@@ -158,15 +154,13 @@ def _without_strays(points: Tensor, poses: Tensor | None) -> tuple[Tensor, str]:
 
 
 def distances_from_middle(places: Tensor) -> Tensor:
-    """Distances [C] of cameras at places [C, 3] from their middle, over that within which most lie;
-    0 if most lie at one place."""
+    """Distances [C] of places [C, 3] from their middle, over that within which most lie, or 0."""
     away = (places - places.median(dim=0).values).norm(dim=-1)
     return (away / away.quantile(NEARER)).nan_to_num(0.0, posinf=0.0)
 
 
 def with_range(bounds: SceneBounds, near: float | None, far: float | None) -> SceneBounds:
-    """The bounds with near and far set by hand; None leaves what was found. InputError for an empty
-    range, or one that begins at the camera."""
+    """The bounds with near and far set by hand, if not None. InputError unless 0 < near < far."""
     near, far = bounds.near if near is None else near, bounds.far if far is None else far
     if not 0.0 < near < far < math.inf:
         raise InputError(f"rays need 0 < near < far, got near {near:g} and far {far:g}")
@@ -296,8 +290,7 @@ def _depths_of_each(poses: Tensor, directions: Tensor, points: Tensor, most: int
 
 
 def blind_cameras(camera_to_worlds: Tensor, directions: Tensor, points: Tensor | None) -> list[int]:
-    """Numbers of the cameras with no sparse point in their field of view; none are where there are
-    no points. Poses, directions and points are as of `find_bounds`."""
+    """Numbers of the cameras that see no point; none without points. Arguments as `find_bounds`."""
     points = usable_points(points)
     if points is None:
         return []
@@ -314,8 +307,7 @@ MOSTLY_ABOVE, MOSTLY_DOWN = 0.75, 0.9
 
 
 def _seen_from_above(poses: Tensor, directions: Tensor, points: Tensor) -> tuple[bool, str]:
-    """Whether nearly all rays go down and most cameras are above nearly all points, and both shares
-    in words."""
+    """Whether rays go down and cameras are above the points, nearly all; and shares in words."""
     above = float((poses[:, 2, 3] > _quantiles(points[:, 2], 0.95)).float().mean())
     down = float(_go_down(directions).float().mean())
     words = f"{down:.0%} of rays go down, {above:.0%} of cameras are above the points"

@@ -55,8 +55,7 @@ class PointCloud(NamedTuple):
 
 
 def description_of_run(file: Path) -> Path | None:
-    """The transforms.json of the run in whose folder a file lies, also of one that was moved with
-    it; None where there is no run, or its data are no scene in nerfstudio's format."""
+    """The transforms.json of the run in whose folder a file lies, moved or not, or None."""
     from leco_plugin.studio.checkpoints import found_around
 
     config = file.resolve().parent / CONFIG
@@ -70,8 +69,7 @@ def description_of_run(file: Path) -> Path | None:
 
 
 def _data_named_in(config: Path) -> Path | None:
-    """The data that a run's config.yml names; None where it cannot be read. Nothing in it is
-    executed, and classes that this version lacks do not matter."""
+    """The data that a run's config.yml names, or None. Nothing in the file is executed."""
     import yaml
 
     class Plain(yaml.SafeLoader):
@@ -92,8 +90,7 @@ def _data_named_in(config: Path) -> Path | None:
 
 
 def description_in(data: Path) -> Path:
-    """The transforms.json that `data` means: itself, or that in the folder. InputError for none, or
-    one without frames."""
+    """The transforms.json that `data` means. InputError for none, or one without frames."""
     file = file_in(data)
     if not file.is_file():
         raise InputError(f"--data {data}: there is no transforms.json; give a nerfstudio scene")
@@ -203,8 +200,7 @@ def views_of(description: Path, places: NDArray[np.float64]) -> NDArray[np.int64
 def _bend(
     slopes: NDArray[np.float64], k1: float, k2: float
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Slopes [N, 2] as a lens with radial distortion bends them, and whether it is folded there, so
-    that they lie further out than its image goes: [N]."""
+    """Slopes [N, 2] bent by a lens with radial distortion, and where it folds them back: [N]."""
     squares = (slopes**2).sum(axis=1)
     factor = 1.0 + k1 * squares + k2 * squares**2
     return slopes * factor[:, None], 1.0 + 3.0 * k1 * squares + 5.0 * k2 * squares**2 <= 0.0
@@ -244,9 +240,8 @@ def points_in_model(points: PointCloud, frame: Tensor) -> dict[str, Tensor]:
 
 
 def told_by(scene: SceneFile, data: Path, outputs: Any) -> dict[str, Any]:
-    """What a transforms.json says beside its photographs, as metadata of what nerfstudio's reader
-    made of it: sparse points, unless the reader has read them, and metres. InputError if it cannot
-    be read."""
+    """Sparse points, unless the reader has read them, and metres of a transforms.json, as metadata
+    of its outputs. InputError if they cannot be read."""
     meta = scene.meta
     try:
         applied, applied_scale = applied_in(meta, scene.path.parent)

@@ -177,9 +177,8 @@ class DatasetUnits:
 
 
 def units_of(datamanager: Any, metres_per_unit: float | None = None) -> DatasetUnits | None:
-    """The units of a data manager's dataset; None where its dataparser does not say what it did.
-    `metres_per_unit` of its poses goes before what the dataparser knows; InputError if it is not
-    positive."""
+    """The units of a dataset, or None where its dataparser does not say what it did.
+    `metres_per_unit` goes before what that knows; InputError if it is not positive."""
     outputs = getattr(datamanager, "train_dataparser_outputs", None)
     scale = float(getattr(outputs, "dataparser_scale", 0.0))
     if outputs is None or not 0.0 < scale < math.inf:
@@ -203,15 +202,13 @@ SKEW = 0.05
 
 
 def distance_from_rotations(matrices: NDArray[np.floating]) -> NDArray[np.floating]:
-    """How far finite [C, 3, 3] are from rotations: the largest error of R R^T = 1 and of det R = 1,
-    [C]; a mirrored rotation has 2."""
+    """The largest errors of R R^T = 1 and det R = 1 of finite [C, 3, 3]: [C]; 2 if mirrored."""
     errors = np.abs(matrices @ matrices.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
     return np.maximum(errors, np.abs(np.linalg.det(matrices) - 1.0))
 
 
 def check_poses(poses: NDArray[np.floating], names: list[str]) -> None:
-    """InputError, with its name, for one of poses [C, 3 or 4, 4] that is not finite or no
-    rotation."""
+    """InputError, with its name, for a pose [C, 3 or 4, 4] that is not finite or no rotation."""
     if poses.shape[1:] not in ((4, 4), (3, 4)):
         raise InputError(f"{names[0]} is no finite 4 x 4 matrix: give it four rows of four")
     broken = ~np.isfinite(poses).all(axis=(1, 2))
@@ -227,8 +224,7 @@ def check_poses(poses: NDArray[np.floating], names: list[str]) -> None:
 
 
 def check_no_contradiction(poses: NDArray[np.floating], names: list[str]) -> None:
-    """InputError for a name to which two of finite poses [C, 3 or 4, 4] belong, that differ by more
-    than rounding."""
+    """InputError for a name of two finite poses [C, 3 or 4, 4] that differ beyond rounding."""
     first: dict[str, int] = {}
     for number, name in enumerate(names):
         before = first.setdefault(name, number)
@@ -258,11 +254,8 @@ before a wall, and holds all photographs alike, are closer together."""
 
 def turn_to_upright(poses: Tensor, points: Tensor | None) -> Tensor | None:
     """The rotation [3, 3] that sets a survey from the air upright; None if it is, or is no survey.
-
-    Up is away from a flat ground, at a right angle to the cameras' right axes, which are level, or
-    across the layer in which they fly, whichever is known. Poses are [C, 3, 4] OpenGL's, points
-    [P, 3] or None.
-    """
+    Up is away from a flat ground, at a right angle to the cameras' level right axes, or across the
+    layer in which they fly. Poses are [C, 3, 4] OpenGL's, points [P, 3] or None."""
     poses = poses.detach().double().cpu()
     looks, places = -poses[:, :, 2], poses[:, :, 3]
     if len(poses) < FEWEST_CAMERAS:
@@ -314,8 +307,7 @@ def _without_strays(points: Tensor) -> Tensor | None:
 
 
 def _spreads(places: Tensor) -> tuple[Tensor, Tensor]:
-    """Standard deviations [3] of places [N, 3] along their principal axes, least first, and the
-    axes as columns [3, 3]."""
+    """Standard deviations [3] of places [N, 3], least first; their principal axes as columns."""
     values, axes = torch.linalg.eigh(torch.cov(places.T))
     return values.clamp(min=0.0).sqrt(), axes
 

@@ -94,8 +94,7 @@ class ReadsNear(DataParser):
         return self._near(super()._get_all_images_and_cameras(*arguments))  # type: ignore[misc]
 
     def _load_3D_points(self, path: Path, *given: Any) -> dict[str, Tensor] | None:
-        """Sparse points in model coordinates and what belongs to them; nothing of a model of COLMAP
-        that has none, as one made of known poses."""
+        """Sparse points in model coordinates; {} of a model of COLMAP made without any."""
         if path.is_dir() and not _has_points(path):
             return {}
         found: dict[str, Tensor] | None = super()._load_3D_points(path, *given)  # type: ignore[misc]
@@ -163,8 +162,7 @@ def _has_points(model: Path) -> bool:
 
 
 def near_bases(kind: type[DataParser]) -> tuple[type[DataParser], ...]:
-    """Bases of a class like this one, with `ReadsNear` before the reader that it takes its poses
-    from; the class itself where that is not known."""
+    """Bases of a class, with `ReadsNear` before the reader that reads its poses, if it is known."""
     for owner in kind.__mro__ if not issubclass(kind, ReadsNear) else ():
         read = vars(owner).get("_generate_dataparser_outputs")
         if SEAMS & {*getattr(getattr(read, "__code__", None), "co_names", ())}:

@@ -47,8 +47,7 @@ SHARE_THAT_VOUCHES = 4
 
 
 class LearningData:
-    """A data manager with nerfstudio's interface, as a learner sees it. Bounds, near and far are
-    what is set by hand. InputError as `survey`."""
+    """A data manager as a learner sees it; near and far by hand. InputError as `survey`."""
 
     def __init__(
         self, manager: Any, bounds: BoundsConfig, near: float | None, far: float | None
@@ -103,9 +102,8 @@ class LearningData:
         return sparse_pixels(dataset.cameras, points, lattice)
 
     def vouching(self, count: int) -> Tensor:
-        """Numbers of the training photographs that can vouch for what is learned from the others,
-        evenly spread: [count]. None [0] where they would be more than a quarter, or batches are
-        not drawn here of all pictures at once."""
+        """Numbers [count] of training photographs, evenly spread, that vouch for what the others
+        taught. [0] where they are over a quarter, or batches are not drawn here of all at once."""
         if count not in self._vouching:
             photographs = len(self.manager.train_dataset)
             can = 0 < SHARE_THAT_VOUCHES * count <= photographs and self._draws_of_all(photographs)
@@ -137,12 +135,10 @@ class LearningData:
     def held_out(
         self, mixture: Mixture, count: int, seed: int = 0, share: Share = "calibration"
     ) -> tuple[Rays, Tensor]:
-        """See `held_out_rays`."""
         return held_out_rays(mixture, self.manager, count, seed, share)
 
     def training_rays(self, mixture: Mixture, count: int, set_aside: int = 0) -> Rays:
-        """Rays [count] of random training pixels, cut to a mixture's region. `set_aside` is as of
-        `prepare_batch`, and for this draw only."""
+        """Rays [count] of training pixels, cut to a mixture's region; as of `prepare_batch`."""
         self.prepare_batch(1.0, distances=False, set_aside=set_aside)
         drawn: list[Rays] = []
         for bundle in training_bundles(self.manager, count):
@@ -196,12 +192,9 @@ def training_bundles(manager: Any, count: int) -> Iterator[Any]:
 def held_out_bundle(
     manager: Any, count: int, seed: int = 0, share: Share = "calibration"
 ) -> tuple[RayBundle, Tensor]:
-    """Up to `count` rays of pixels that are never trained on, and true colours [R, 3 or 4].
-
-    They are of training images, whose appearance is known: an unknown exposure would stand in every
-    error, and hide what skipping adds to it. A data manager without held-out pixels gives ordinary
-    training rays; the report says so.
-    """
+    """Up to `count` rays of pixels that are never trained on, and true colours [R, 3 or 4]. They
+    are of training images: an unknown exposure would hide what skipping adds to an error. Without
+    held-out pixels they are ordinary training rays; the report says so."""
     if (sampler := held_out_sampler(manager)) is None:
         bundle, batch = manager.next_train(0)
         return bundle[:count], batch["image"][:count]

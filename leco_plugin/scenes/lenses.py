@@ -93,8 +93,7 @@ def lens_of(meta: dict[str, Any], frame: dict[str, Any], where: str) -> Lens:
 
 
 def set_lenses(cameras: Cameras, lenses: list[Lens | None], factor: int) -> None:
-    """Gives each camera of the pictures' sizes its lens, in place; of None it keeps its own.
-    Pictures are smaller by `factor` than lenses are for."""
+    """Gives cameras of pictures smaller by `factor` their lenses, in place; of None their own."""
     for name in ("fx", "fy", "cx", "cy", "camera_type", "distortion_params"):
         if (shared := getattr(cameras, name)) is not None:  # by all, where they had one value
             setattr(cameras, name, shared.expand(len(lenses), -1).clone())
@@ -124,8 +123,7 @@ def set_lenses(cameras: Cameras, lenses: list[Lens | None], factor: int) -> None
 
 
 def check_together(lenses: list[Lens], where: str) -> None:
-    """InputError if frames mix other types than perspective and fisheye, or if their fisheyes show
-    circles of several sizes."""
+    """InputError for kinds that do not mix, or fisheyes with circles of several sizes."""
     kinds = {lens.kind or CameraType.PERSPECTIVE for lens in lenses}
     if len(kinds) > 1 and not kinds <= MIXED:
         names = " and ".join(sorted(kind.name for kind in kinds))
@@ -204,7 +202,6 @@ def _distortion(owner: dict[str, Any], kind: CameraType | None, where: str) -> l
 
 
 def _refuse_other_lenses(owner: dict[str, Any], where: str) -> None:
-    """InputError for what would be dropped."""
     for name in OTHERS:
         if owner.get(name) not in (None, 0, False, "perspective", "Perspective", "OpenCV"):
             raise InputError(

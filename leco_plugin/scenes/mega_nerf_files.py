@@ -87,11 +87,9 @@ def around(positions: Array) -> Coordinates:
 
 
 def wrong_axis(poses: Array) -> str | None:
-    """Why the poses [C, 3, 4] of a scene are not (down, right, back), or None if they may be.
-
-    An upright camera's right axis is level, it does not look far above the horizon, and its top is
-    not below. Whichever direction is down, nearly all cameras of a survey agree on it.
-    """
+    """Why poses [C, 3, 4] are not (down, right, back), or None. An upright camera's right axis is
+    level, it does not look far above the horizon, and its top is not below: nearly all cameras of a
+    survey agree on what is down."""
     rights, tops, looks = poses[:, :, 0], poses[:, :, 1], -poses[:, :, 2]
 
     def upright(axis: int, sign: float) -> float:
@@ -115,8 +113,7 @@ def wrong_axis(poses: Array) -> str | None:
 ENDINGS = (".jpg", ".JPG", ".png", ".PNG")
 """Of pictures, in the order in which Mega-NeRF looks for them."""
 KINDS = ("JPEG", "MPO", "PNG")
-"""By content, as Pillow calls them, which hands some others to other programs to decode them. MPO
-is a JPEG with a preview, as of a drone."""
+"""By content, as Pillow calls them. MPO is a JPEG with a preview, as of a drone."""
 _MOST_PIXELS = 1 << 16
 """A side."""
 
@@ -167,11 +164,8 @@ class MegaNerfScene:
 
 
 def read_scene(folder: Path, check_axes: bool = True) -> MegaNerfScene:
-    """Reads and checks everything but pixels.
-
-    `check_axes` refuses a world whose first axis does not point down. InputError, in one line,
-    names a file and what is wrong with it.
-    """
+    """Reads and checks everything but pixels; `check_axes` refuses a first axis that does not point
+    down. InputError, in one line, names a file and what is wrong with it."""
     require_folder(folder, "give one with --data")
     coordinates = read_coordinates(folder / "coordinates.pt")
     pairs = sorted(_pairs(folder, "train") + _pairs(folder, "val"), key=lambda pair: pair[0].name)

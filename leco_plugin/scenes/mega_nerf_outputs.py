@@ -66,8 +66,7 @@ def read(config: MegaNerfDataParserConfig) -> MegaNerfScene:
 def outputs_of(
     config: MegaNerfDataParserConfig, scene: MegaNerfScene, training: bool
 ) -> DataparserOutputs:
-    """The pictures that are trained on, or scored, as nerfstudio takes them. InputError if a
-    picture, a mask or the file of points is wrong."""
+    """The pictures to train on, or to score. InputError for a wrong picture, mask or point file."""
     half = config.protocol == "half"
     splits = ("train", "val") if training and half else ("train",) if training else ("val",)
     frames = [frame for frame in scene.frames if frame.split in splits]

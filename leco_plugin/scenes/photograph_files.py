@@ -74,8 +74,7 @@ def opened(path: Path) -> Iterator[Image.Image]:
 
 def header_of(path: Path, turned: bool = True) -> Header:
     """What a file of an image says. InputError if it is none. Unless it may be `turned`, it counts
-    as upright: to look for an orientation, which may stand behind the pixels, Pillow decodes a PNG.
-    """
+    as upright: to look for an orientation, Pillow decodes a PNG."""
     try:
         with opened(path) as image:
             several = image.format != "MPO" and getattr(image, "n_frames", 1) > 1
@@ -223,8 +222,7 @@ def decode(path: Path, turn: bool) -> Image.Image:
 
 
 def names_what_it_cannot_read(dataset: Any) -> Any:
-    """A dataset of nerfstudio's. Where an image or what comes with it cannot be read, an InputError
-    names the image in one line."""
+    """nerfstudio's dataset; for what it cannot read, an InputError names the image in one line."""
     read, paths = dataset.get_data, dataset.image_filenames
 
     def read_or_name(image_idx: int, *arguments: Any, **options: Any) -> Any:
@@ -242,9 +240,8 @@ def names_what_it_cannot_read(dataset: Any) -> Any:
 
 
 class DerivedImages:
-    """A folder of PNG files that are made when they are first asked for, and again once their
-    source (path, size, time of change) or the recipe has changed. `remedy` is what to do where
-    nothing can be written."""
+    """A folder of PNG files, made when first asked for, and again once their source (path, size,
+    time of change) or recipe has changed. `remedy` is for where nothing can be written."""
 
     def __init__(
         self, folder: Path, remedy: str = "give another folder for derived pictures with --cache"
@@ -316,8 +313,7 @@ def convert_masks(
 
 
 def seen_pixels(mask: Path, image: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """The pixels [H, W] that a mask shows of an image of this width and height. InputError if it
-    cannot be read, has colours or another size."""
+    """The pixels [H, W] that a mask shows of an image of this size. InputError about the mask."""
     path = _found(mask, image)
     return _fit(_is_seen(_values(path)), size, path)
 
@@ -336,8 +332,7 @@ def _found(path: Path, image: Path) -> Path:
 
 
 def _values(path: Path) -> NDArray[np.uint8]:
-    """How light each pixel of a mask is: [H, W], 0 to 255, transparent ones 0. InputError if it
-    cannot be read, or has colours."""
+    """How light a mask is: [H, W], 0 to 255, 0 if transparent. InputError for none, or colours."""
     try:
         with Image.open(path) as image:
             if image.mode in ("1", "L") and "transparency" not in image.info:
@@ -362,8 +357,7 @@ def _is_seen(values: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 
 def _fit(seen: NDArray[np.bool_], size: tuple[int, int], path: Path) -> NDArray[np.bool_]:
-    """The pixels of a mask that has its image's size, or a whole number of times that. InputError
-    if it has another size."""
+    """A mask [H, W] in its image's size, from that or a whole number of times it, or InputError."""
     high, wide = seen.shape
     if (wide, high) == size:
         return seen

@@ -149,12 +149,8 @@ TRAINED = 0.5
 
 def find_stretch(positions: Array) -> tuple[list[int], list[int]]:
     """The stretch of cameras at [C, 3] near the middle that ends with the widest gap, and those
-    beside it, by number.
-
-    It grows from the camera next to the middle, by the nearest camera each time. So it follows a
-    line or an arc whose cameras are nearer to each other than to those of the next line. ValueError
-    if there are too few cameras, or they stand too close together.
-    """
+    beside it, by number. It grows from the middle by the nearest camera each time, so that it
+    follows a line or an arc. ValueError for too few cameras, or too close together."""
     if (count := len(positions)) < FEWEST:
         few = f"there are {count} cameras"
         raise ValueError(f"{few}, and a stretch is held out of {FEWEST} or more")

@@ -45,8 +45,7 @@ UNWRITABLE = "make the folder of the scene writable, or convert its pictures and
 
 
 class CheckedReader(DataParser):
-    """Stands before a reader among the bases of a class: its outputs are checked, and each of its
-    errors is one line."""
+    """Stands before a reader among a class's bases: outputs are checked, errors are one line."""
 
     def __init__(self, config: base_dataparser.DataParserConfig) -> None:
         super().__init__(config)
@@ -119,8 +118,7 @@ def reader_name(config: Any) -> str:
 
 
 def _check_lists(scene: SceneFile) -> None:
-    """InputError for a list of photographs, as of those for tests, that is none or names others
-    than frames do."""
+    """InputError for a list of photographs that is none, or names others than frames do."""
     known = {*scene.pictures()}
     for key in ("train_filenames", "val_filenames", "test_filenames"):
         listed = scene.meta.get(key, [])
@@ -196,9 +194,8 @@ def _lacks_its_file(error: BaseException, config: Any) -> bool:
 def checked(
     outputs: DataparserOutputs, config: Any, split: str, scene: SceneFile | None
 ) -> DataparserOutputs:
-    """What a reader returned, with every picture, mask and lens such as the files say. InputError
-    for what cannot be read rightly. Some pictures and masks are converted into
-    `leco-cache/pictures` beside the data."""
+    """What a reader returned, with pictures, masks and lenses such as the files say; some are
+    converted into `leco-cache/pictures` beside the data. InputError for what cannot be read."""
     outputs.metadata = dict(outputs.metadata)
     if not outputs.image_filenames:
         return outputs

@@ -33,9 +33,7 @@ from leco_plugin.scenes.whole_files import begins_with
 FRAMES = ("frames", "test_frames")
 """Lists of frames; the second is ScanNet++'s."""
 NO_SCENE = (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
-"""What a JSON file that is no scene raises."""
 MAKE_ANEW = "make it anew from the photographs, with leco poses or ns-process-data"
-"""What to do about a transforms.json that is no scene."""
 
 
 @dataclass(frozen=True)
@@ -167,8 +165,7 @@ def description_of(config: Any, split: str) -> Path | None:
 
 
 def scene_file_of(config: Any, split: str) -> SceneFile | None:
-    """The transforms.json that a reader is about to read; None where it reads others. InputError if
-    it is not there, or as `read_scene_file`."""
+    """The transforms.json that a reader will read, or None. InputError as `read_scene_file`."""
     data, file = Path(config.data), description_of(config, split)
     if file is None:
         return None
@@ -260,8 +257,7 @@ def unused_fields(meta: dict[str, Any]) -> list[str]:
 
 
 def say_unused(meta: dict[str, Any], file: Path, has_times: bool) -> None:
-    """One line in the log for what a scene says, or has beside it, that is not used; `has_times` is
-    whether its reader has taken the time of each frame."""
+    """Says in one line what a scene has that is not used; `has_times`: its reader took times."""
     unused = [name for name in unused_fields(meta) if name != "time" or not has_times]
     folder = (file.parent / str(meta["frames"][0]["file_path"])).parent
     beside = ("dynamic_mask_*", "rays_*.dat", "*.alpha.*")

@@ -25,7 +25,6 @@ LONGEST = 40
 """Letters of a name that an unfinished file has too: of 255 bytes each takes up to 4."""
 POINTER = b"version https://git-lfs"
 FETCH = "is a pointer of Git LFS: `git lfs pull` fetches the file"
-"""What to say of a file that `is_pointer`."""
 
 
 def write_whole(path: Path, content: bytes | Callable[[BinaryIO], object]) -> None:
@@ -56,8 +55,7 @@ def begins_with(path: Path, mark: bytes) -> bool:
 
 
 def write_json(path: Path, value: Any, indent: int = 2, allow_nan: bool = False) -> None:
-    """Writes JSON whole or not at all; folders are made. NaN and infinity raise ValueError unless
-    allowed."""
+    """Writes JSON whole or not at all; folders are made. ValueError for NaN, unless allowed."""
     text = json.dumps(value, indent=indent, allow_nan=allow_nan) + "\n"
     write_whole(path, text.encode())
 
@@ -93,9 +91,8 @@ def write_points(
 
 
 def check_place(option: str, path: Path | None) -> None:
-    """InputError if a file cannot be written there: it is a folder or a device, or one of its
-    folders is a file or takes no new file. Tries it with a file that has no name, as rights do not
-    say all."""
+    """InputError if a file cannot be written there: it is a folder or a device, or its folder takes
+    no new file. Tries it with a file that has no name, as rights do not say all."""
     if path is None:
         return
     is_device = path.parent == Path("/dev")  # a file would take its place
@@ -132,8 +129,7 @@ def check_report(path: Path | None, *read: Path | None) -> None:
 
 
 def check_picture(option: str, path: Path | None, moving: bool = False) -> None:
-    """As `check_place`; InputError too for an unknown kind of picture. A `moving` one may be a
-    .gif."""
+    """As `check_place`, and for an unknown kind of picture; a `moving` one may be a .gif."""
     check_place(option, path)
     if path is None:
         return

@@ -123,7 +123,6 @@ class Block:
 
 
 def _inset(area: Rectangle, by: float) -> Rectangle:
-    """The rectangle without a rim."""
     x0, x1, y0, y1 = area
     return x0 + by, x1 - by, y0 + by, y1 - by
 

@@ -91,8 +91,7 @@ class Lens:
     focal: float
 
     def directions(self, offset: tuple[float, float] = (0.5, 0.5)) -> Array:
-        """Unit directions [height, width, 3], OpenGL camera axes, through a place in each pixel, in
-        pixels from its upper left corner."""
+        """Unit directions [height, width, 3], OpenGL axes, through a place in each pixel."""
         rows, columns = np.mgrid[: self.height, : self.width]
         x = (columns + offset[0] - self.width / 2) / self.focal
         y = (self.height / 2 - rows - offset[1]) / self.focal
@@ -111,8 +110,7 @@ class Lens:
         most: int,
         random: Generator,
     ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Up to so many points [P, 3] that a picture [height, width, 3 or 4] shows, and their
-        colours [P, 3]."""
+        """Up to `most` points [P, 3] of a picture [height, width, 3 or 4]; colours [P, 3]."""
         seen = np.argwhere(np.isfinite(depth))
         chosen = tuple(seen[random.permutation(len(seen))[:most]].T)
         return self.points(pose, depth)[chosen].astype(np.float32), image[chosen][:, :3]

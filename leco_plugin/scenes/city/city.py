@@ -29,8 +29,7 @@ _PAIRS = 1 << 15
 def _groups(
     points: Array, shapes: int, prune: Callable[[Array, Array, Indices], Indices]
 ) -> Iterator[tuple[Indices, Indices]]:
-    """Splits points [N, 3] into groups; yields their indices and those of the shapes that matter,
-    which `prune(low, high, candidates)` keeps for a box."""
+    """Indices of groups of points [N, 3], and of the shapes that `prune` keeps for their boxes."""
     stack = [(np.arange(len(points)), np.arange(shapes))] if len(points) else []
     while stack:
         group, candidates = stack.pop()
@@ -81,8 +80,7 @@ class Solids:
 
 
 class Faces:
-    """The surface of some shapes: axis-aligned rectangles [R, 2, 3], low and high corners, then
-    triangles [T, 3, 3]."""
+    """Axis-aligned rectangles [R, 2, 3], low and high corners, then triangles [T, 3, 3]."""
 
     def __init__(self, rectangles: Array, triangles: Array) -> None:
         self.first, self.triangles = len(rectangles), triangles
@@ -97,11 +95,8 @@ class Faces:
         return np.sqrt(nearest)
 
     def _reachable(self, low: Array, high: Array, candidates: Indices) -> Indices:
-        """Faces that can be nearest to some point of the box low..high.
-
-        Seen from its middle, a rectangle is as far as its bounds, and any other face is at least
-        that far and no farther than their farthest corner.
-        """
+        """Faces that can be nearest to a point of the box low..high: a rectangle is as far as its
+        bounds, any other face as far at least, and no farther than their farthest corner."""
         middle, radius = (low + high) / 2, np.linalg.norm(high - low) / 2
         bounds = self.bounds[candidates]
         least = np.maximum(np.maximum(bounds[:, 0] - middle, middle - bounds[:, 1]), 0)
@@ -113,11 +108,8 @@ class Faces:
         return candidates[least <= reach * (1 + 1e-9)]
 
     def _nearest(self, points: Array, candidates: Indices) -> Array:
-        """Squared distance [N] from each of points [N, 3] to the nearest of `candidates`.
-
-        The bounds give a rectangle's distance and a lower limit of the others'; only faces whose
-        limit undercuts what is known already are measured.
-        """
+        """Squared distance [N] from points [N, 3] to the nearest of `candidates`. Triangles are
+        measured only where their bounds are nearer than what is known already."""
         limits = np.zeros((len(points), len(candidates)))
         for axis in range(3):
             column, bounds = points[:, axis, None], self.bounds[candidates, :, axis]
@@ -139,9 +131,8 @@ class Faces:
 
 
 def squared_to_triangles(points: Array, triangles: Array) -> Array:
-    """Squared distances [M] from points [M, 3] to triangles [M, 3, 3]: over a triangle's inside the
-    height above its plane counts, elsewhere the nearest edge. A machine that has torch alone, as of
-    the GPU suite, lacks trimesh, which could do this."""
+    """Squared distances [M] from points [M, 3] to triangles [M, 3, 3]. A machine that has torch
+    alone, as of the GPU suite, lacks trimesh, which could do this."""
     start, away = triangles[:, 0], points - triangles[:, 0]
     u, v = triangles[:, 1] - start, triangles[:, 2] - start
     uu, uv, vv = _dot(u, u), _dot(u, v), _dot(v, v)
@@ -163,7 +154,6 @@ def squared_to_triangles(points: Array, triangles: Array) -> Array:
 
 
 def _dot(a: Array, b: Array) -> Array:
-    """Scalar products of rows: [M, 3], [M, 3] -> [M]."""
     return np.einsum("mk,mk->m", a, b)
 
 

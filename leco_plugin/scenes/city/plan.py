@@ -33,8 +33,7 @@ _EDGE_PARTS = 3
 
 
 def choose_blocks(blocks: int, seed: int) -> NDArray[np.bool_]:
-    """Which cells of the [blocks, blocks] square are built: the rim has gaps, and from `LARGE` on
-    the outline has bays and headlands instead."""
+    """Which cells [blocks, blocks] are built: the rim has gaps or, from `LARGE` on, bays."""
     built = np.ones((blocks, blocks), bool)
     if blocks < 3:
         return built

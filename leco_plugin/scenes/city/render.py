@@ -38,8 +38,7 @@ def _noise(u: Array, v: Array) -> Colours:
 
 
 def _covered(position: Array, period: Spacing, width: Spacing, pixel: Array) -> Colours:
-    """Share of a pixel (metres wide) that stripes of `width` cover, repeating every `period`: the
-    exact integral, so that they blur instead of flickering."""
+    """Share of a pixel, metres wide, that stripes of `width` every `period` cover, exactly."""
 
     def integral(x: Array) -> Array:
         whole = np.floor(x / period)
@@ -53,11 +52,8 @@ def _covered(position: Array, period: Spacing, width: Spacing, pixel: Array) -> 
 def paint_surface(
     city: City, positions: Array, normals: Array, paint: NDArray[np.int64], pixel: Array
 ) -> Colours:
-    """Reflectance (RGB in 0..1) [N, 3] float32 of surface points.
-
-    Of positions [N, 3] in metres with unit normals [N, 3] outward, rows of the city's palette [N],
-    and the width of a pixel there [N] in metres.
-    """
+    """Reflectance [N, 3] float32, RGB in 0..1, of positions [N, 3] in metres with outward unit
+    normals [N, 3], rows of the palette [N], and the width of a pixel there [N] in metres."""
     material = city.material[paint]
     colour = city.colour[paint].copy()
     local = positions - city.anchor[paint]
@@ -186,8 +182,7 @@ class Tracer:
         return faces, depths
 
     def colour(self, origins: Array, directions: Array, angle: float) -> tuple[Colours, Array]:
-        """Light and depth along rays [N, 3] whose pixels have this angle: RGB in 0..1, [N, 3], and
-        metres, [N]."""
+        """Light [N, 3], RGB in 0..1, and depth [N], metres, along rays [N, 3] of so wide pixels."""
         faces, depths = self.cast(origins, directions)
         has_sky = self.city.config.sky
         colours = sky(directions) if has_sky else np.zeros(directions.shape, np.float32)
@@ -216,11 +211,9 @@ class Tracer:
     def photograph(
         self, camera_to_world: Array, lens: Lens
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Takes one antialiased picture from a pose [3, 4] in metres, OpenGL axes.
-
-        Returns the image [height, width, 3] sRGB, and the depth [height, width] in metres along the
-        ray through the pixel's middle, inf where it meets nothing.
-        """
+        """An antialiased picture [height, width, 3], sRGB, from a pose [3, 4] in metres, OpenGL
+        axes, and the depth [height, width] in metres along the ray through each pixel's middle, inf
+        for nothing."""
         size = lens.height, lens.width
         image, depth = np.zeros((*size, 3), np.float32), np.zeros(size, np.float32)
         for number, place in enumerate(QUINCUNX):

@@ -118,12 +118,9 @@ def add_turned(
     foot: int,
     sides: int = 8,
 ) -> None:
-    """Stands a turned solid (pole, tree, tank) on the canvas at x, y, on a low square foot, which
-    keeps the hidden face under it simple: a square without a regular polygon.
-
-    `profile` lists radius and height above the foot in metres, from the foot up, with the paint of
-    the stretch that ends there; `sides` is a multiple of 4.
-    """
+    """Stands a turned solid (pole, tree, tank) on a low square foot, which keeps the face under it
+    simple. `profile` lists radius and height above the foot in metres, from the foot up, with the
+    paint of the stretch that ends there; `sides` is a multiple of 4."""
     reach = round(profile[0][0] + 0.12, 2)
     x, y = round(float(x), 2), round(float(y), 2)
     base = round(canvas.height(x, y) + 0.12, 2)
@@ -182,10 +179,8 @@ class Stroke(NamedTuple):
 
 @dataclass
 class Canvas:
-    """A rectangle of land whose height is painted: later strokes replace earlier ones.
-
-    The land is at height 0 along the canvas' border, so that canvases join without a wall.
-    """
+    """Land whose height is painted: later strokes replace earlier ones. It is at height 0 along the
+    border, so that canvases join without a wall."""
 
     bounds: Rectangle
     paint: int
@@ -286,8 +281,7 @@ class Palette(list[tuple[Material, Colour, Colour, tuple[float, float]]]):
         anchor: tuple[float, float, float] = (0.0, 0.0, 0.0),
         pitch: tuple[float, float] = (3.0, 3.0),
     ) -> int:
-        """Returns the number of the new paint; its pattern starts at `anchor` (metres), and windows
-        are `pitch` apart along x and y (metres)."""
+        """The number of a new paint: its pattern begins at `anchor`, windows are `pitch` apart."""
         self.append((material, colour, anchor, pitch))
         return len(self) - 1
 

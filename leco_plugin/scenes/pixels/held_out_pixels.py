@@ -84,8 +84,7 @@ class Lattice:
 
 
 def lattice_for(sizes: Sequence[Sequence[int]] | Tensor) -> Lattice:
-    """The thinnest lattice that holds out as many pixels as are wanted, of pictures of sizes [P, 2]
-    (height, width); the densest where none does."""
+    """The thinnest lattice with `WANTED` pixels of sizes [P, 2] (height, width), or the densest."""
     sizes = torch.as_tensor(sizes)
     for period in PERIODS:
         if int(Lattice(period).counts(sizes).prod(dim=-1).sum()) >= WANTED:
@@ -219,8 +218,7 @@ class HeldOutPixelSampler(PixelSampler):
         return corners.abs().maximum((corners + 1).abs()).square().sum(dim=-1) <= radius**2
 
     def _may_be_drawn(self, pixels: Tensor, sizes: Tensor, numbers: Tensor | None) -> Tensor:
-        """Whether pixels are shown, and of pictures that are not set aside; as `shown`. Where all
-        pictures that can be drawn of are set aside, that does not count."""
+        """Whether pixels are shown, and not set aside unless all are; arguments as `shown`."""
         shown = self.shown(pixels, sizes, numbers)
         if self.set_aside is None:
             return shown
@@ -236,9 +234,8 @@ class HeldOutPixelSampler(PixelSampler):
         sizes: Tensor,
         numbers: Tensor | None = None,
     ) -> Tensor:
-        """Drawn pixels [count, 3], those drawn anew that a fisheye does not show, or whose pictures
-        are set aside. `sizes` as of `shown`, or [P, 2] of all pictures. InputError if none of those
-        drawn is shown."""
+        """Drawn pixels [count, 3]; others in place of those that may not be drawn. `sizes` as of
+        `shown`, or [P, 2] of all pictures. InputError if none of those drawn is shown."""
         pixels = draw(count)
         for _ in range(TRIES):
             each = sizes if sizes.dim() == 1 else sizes[pixels[:, 0]]
@@ -276,8 +273,7 @@ class HeldOutPixelSampler(PixelSampler):
         return self._aside(indices, pictures.sizes[indices[:, 0]])
 
     def _aside(self, indices: Tensor, sizes: Tensor) -> Tensor:
-        """Pixels [N, 3] of pictures of sizes [2] or [N, 2]; held-out ones give way to their
-        neighbours, towards the middle."""
+        """Pixels [N, 3] of sizes [2] or [N, 2], held-out ones moved by one towards the middle."""
         columns = indices[:, 2]
         aside = torch.where(columns < sizes[..., 1] // 2, columns + 1, columns - 1)
         indices[:, 2] = torch.where(self.lattice.holds_out(indices), aside, columns)
@@ -298,13 +294,10 @@ class HeldOutPixelSampler(PixelSampler):
     def sample_held_out(
         self, images: dict[str, Any], count: int, seed: int, share: Share = "all"
     ) -> dict[str, Tensor]:
-        """Up to `count` held-out pixels, each once, as `sample` returns them: `image` [N, C] and
-        `indices` [N, 3] int64 (image, row, column); the same for a seed.
-
-        Of a batch of the image loader: `image` [K, H, W, C] or a list of [H, W, C], `image_idx`
-        [K], and `mask` if any. Where images are so tiny, or masks hide so much, that none of the
-        share is left, of all shares.
-        """
+        """Up to `count` held-out pixels, each once, the same for a seed: `image` [N, C] and
+        `indices` [N, 3] int64 (image, row, column). `images` is a batch of the image loader:
+        `image` [K, H, W, C] or a list of [H, W, C], `image_idx` [K], and `mask` if any. Where none
+        of the share is left, as of tiny images, of all shares."""
         which, within = self._held_out(images, count, seed, share)
         numbers = torch.as_tensor(images["image_idx"]).cpu()[which]
         return {
@@ -333,8 +326,7 @@ class HeldOutPixelSampler(PixelSampler):
     def _visible(
         self, images: dict[str, Any], places: Tensor, sizes: Tensor, numbers: Tensor
     ) -> Tensor:
-        """Those of pixels [N, 3] (place in the batch, row, column) that no lens and no mask
-        hides."""
+        """Those of pixels [N, 3] (place in the batch, row, column) that no lens or mask hides."""
         places = places[self.shown(places, sizes[places[:, 0]], numbers)]
         if "mask" in images:
             seen = look_up(images["mask"], places[:, 0], places[:, 1:]).flatten(1).all(dim=1)

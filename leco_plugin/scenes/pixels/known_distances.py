@@ -70,10 +70,9 @@ def _at_most(most: int, rows: Tensor) -> Tensor:
 
 
 def project(cameras: Cameras, number: int, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Image places of points [P, 2] (row, column; whole numbers are the upper left corners of
-    pixels), and their distances [P], scene units, negative where the camera does not see them:
-    behind it, or so far outside that the formula of its lens folds them back into the image.
-    """
+    """Image places of points [P, 2] (row, column; whole numbers are upper left corners of pixels),
+    and distances [P], scene units, negative where the camera does not see them: behind it, or where
+    the formula of its lens folds them back into the image."""
     pose = cameras.camera_to_worlds[number]
     local = (points - pose[:, 3]) @ pose[:, :3]
     ahead = -local[:, 2]
@@ -102,9 +101,8 @@ def distort(x: Tensor, y: Tensor, params: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def folds_at(params: Tensor) -> float:
-    """The square of the normalised radius from which on radial distortion (OpenCV: k1 k2 k3 k4)
-    no longer grows; beyond, two places share a pixel. Infinite where that is outside of any image.
-    """
+    """The squared normalised radius from which on radial distortion (OpenCV: k1 k2 k3 k4) no longer
+    grows, and two places share a pixel. Infinite where that is outside of any image."""
     powers, squares = torch.arange(1, 5), torch.linspace(0.0, 4.0, 1001)
     slopes = 1.0 + ((2 * powers + 1) * params[:4].cpu() * squares[:, None] ** powers).sum(dim=1)
     folded = squares[slopes <= 0.0]
@@ -112,8 +110,7 @@ def folds_at(params: Tensor) -> float:
 
 
 def hidden(pixels: Tensor, lengths: Tensor, height: int, width: int) -> Tensor:
-    """Which points at pixels [P, 2] (row, column) and distances [P] of one image lie plainly behind
-    a neighbour there: bool [P]."""
+    """Which of pixels [P, 2] (row, column) at distances [P] lie behind a neighbour: bool [P]."""
     cell = max(1, round(math.sqrt(POINTS_PER_CELL * height * width / max(len(pixels), 1))))
     rows, columns = -(-height // cell), -(-width // cell)
     places = pixels[:, 0] // cell * columns + pixels[:, 1] // cell

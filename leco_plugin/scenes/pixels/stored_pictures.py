@@ -65,11 +65,9 @@ class StoredPictures:
 
 def store_pictures(dataset: Any, folder: Path, what: str = "photographs") -> dict[str, Any]:
     """Decodes what a dataset (nerfstudio's `InputDataset`) has not yet decoded into `folder`.
-
-    Returns a batch as of nerfstudio's image loader: `image` and, if there are masks, `mask`, both
+    Returns a batch as of its loader: `image` and, if there are masks, `mask`, both
     `StoredPictures`, and `image_idx` [P]. InputError if nothing can be written there, or the
-    pictures have no common form.
-    """
+    pictures have no common form."""
     sizes = picture_sizes(dataset)
     masked = outputs_of(dataset).mask_filenames is not None
     names = [_name(dataset, number) for number in range(len(dataset))]

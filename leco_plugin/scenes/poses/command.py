@@ -57,12 +57,9 @@ NAMED = 5
 def make_scene(
     folder: Path, out: Path, lens: Lens = "perspective", size: int = 1600, threads: int = 0
 ) -> dict[str, Any]:
-    """Makes a scene of photographs, unless `out` already holds it; returns the report. Goes on with
-    what a killed run has left.
-
+    """Makes a scene of photographs, or goes on with it, unless `out` holds it; returns the report.
     Features are looked for at a longest side of `size` pixels; 0 threads are all. InputError if
-    `out` holds something else, or the photographs cannot be used; ImportError without pycolmap.
-    """
+    `out` holds something else, or the photographs cannot be used; ImportError without pycolmap."""
     check_options(size, threads)
     pycolmap = load_pycolmap()
     folder, out, began = folder.resolve(), out.resolve(), time.monotonic()
@@ -133,8 +130,7 @@ def _read(file: Path) -> dict[str, Any] | None:
 
 
 def _finished(out: Path, asked: dict[str, Any]) -> dict[str, Any] | None:
-    """The report of a finished scene; None of one that is to be made or to go on. InputError if the
-    folder holds something else."""
+    """The report of a finished scene, or None. InputError if the folder holds something else."""
     found = _read(out / ASKED)
     if found is None:
         # a full disk leaves folders without a file, and others' programs hidden files

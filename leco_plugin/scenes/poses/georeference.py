@@ -81,11 +81,9 @@ def local_places(
 
 
 def upright(poses: Array, points: Array) -> Array:
-    """The direction [3] that is up in a reconstruction of OpenGL poses [C, 3, 4] and points [P, 3].
-
-    Of surveys from the air it is seen from ground and cameras. Of others it is the mean of the
-    photographs' top edges, or against the mean view where these point in all directions.
-    """
+    """The direction [3] that is up, by OpenGL poses [C, 3, 4] and points [P, 3]. Of surveys from
+    the air ground and cameras tell it. Of others it is the mean of the photographs' top edges, or
+    against the mean view where these point in all directions."""
     # a survey that lies within 20 degrees of upright is not turned: laid down, it is
     for base in (np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.eye(3)):
         turn = turn_to_upright(torch.from_numpy(base @ poses), torch.from_numpy(points @ base.T))
@@ -106,13 +104,10 @@ def place(
     altitudes: bool = True,
 ) -> Placement:
     """The similarity that takes a reconstruction to metres, or a rotation that sets it upright.
-
-    Of camera centres [C, 3] with positions by GPS [C, 3] in metres, nan where not known; a flight
-    along one line also needs what is up [3] in the reconstruction. The mean `top` [3] of the
-    photographs' top edges, if given, has a word where GPS would turn that upside down, and their
-    right edges `rights` [C, 3] have one where altitudes would tilt it. Where altitudes are not
-    known, or contradict the poses, what is up takes their place.
-    """
+    Centres [C, 3] have positions by GPS [C, 3] in metres, or nan; `up` [3] rolls a flight along one
+    line. The mean `top` [3] of the photographs' top edges counts where GPS would turn it upside
+    down, right edges `rights` [C, 3] where altitudes would tilt it. Where altitudes are not known,
+    or contradict the poses, `up` takes their place."""
     placed = _place_in_space(pycolmap, centres, gps, up, top)
     tilts = placed.residuals is not None and _is_tilted(placed.turn, up, rights)
     if altitudes and placed.residuals is not None and not tilts:
@@ -161,8 +156,7 @@ def _place_on_the_level(centres: Array, gps: Array, up: Array) -> Placement | No
 def _place_in_space(
     pycolmap: Any, centres: Array, gps: Array, up: Array, top: Array | None
 ) -> Placement:
-    """A placement by positions with their altitudes; upright in units of its own, with the reason,
-    where these contradict the poses."""
+    """A placement by positions with altitudes; by `up`, with the reason, if these contradict."""
     there = np.isfinite(gps).all(axis=1)
     known, count = gps[there], int(there.sum())
     if count < FEWEST:
@@ -274,8 +268,7 @@ def points_of(model: Any) -> tuple[Array, NDArray[np.uint8]]:
 
 
 def transforms_of(model: Any, placement: Placement, origin: Position | None) -> dict[str, Any]:
-    """What transforms.json says of a model that a placement has put into the world, with the place
-    of its origin if coordinates are metres."""
+    """A transforms.json of a placed model, with its origin's place if coordinates are metres."""
     lenses = {number: intrinsics(camera) for number, camera in model.cameras.items()}
     names, poses = poses_of(model)
     used = [model.find_image_with_name(name).camera_id for name in names]

@@ -65,9 +65,8 @@ def read_exif(image: Image.Image) -> Exif:
 
 
 def focal_length(details: Mapping[int, Any], size: tuple[int, int]) -> float | None:
-    """Focal length over the longest side of a picture of a width and height. The 35 mm equivalent
-    goes before the sensor's resolution, which is that of the picture as taken, not of one made
-    smaller."""
+    """Focal length over the longest side of a picture of a size, or None. The 35 mm equivalent goes
+    before the sensor's resolution, which is that of the picture as taken."""
 
     def said(tag: ExifTags.Base) -> float:
         return _number(details.get(tag))
@@ -141,7 +140,6 @@ and an ending behind."""
 PROBED = 4096
 """Bytes at either end of a file that tell most apart before all of them are compared."""
 QUALITY = 95
-"""Of a JPEG that is written anew."""
 MOST_EXIF = 65_533
 """Bytes of EXIF that a JPEG can hold."""
 
@@ -236,9 +234,8 @@ def find_photographs(folder: Path, out: Path) -> Found:
 
 
 def without_repeats(found: Found) -> Found:
-    """What was found without photographs whose files have the bytes of one before, as of two cards
-    that were copied twice: one for training and its copy for tests would score themselves.
-    InputError for fewer than three others."""
+    """What was found, each file once: a copy for tests would score its original in training.
+    InputError for fewer than three."""
     firsts: dict[tuple[int, bytes], list[Path]] = {}
     repeats: dict[Path, str] = {}
     for path in (each.path for each in found.photographs):

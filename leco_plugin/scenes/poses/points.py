@@ -50,12 +50,10 @@ photographs, 12 to 15% where their poses are shuffled."""
 
 def find_points(data: Path, size: int = 1600, threads: int = 0) -> dict[str, Any]:
     """Gives a scene (folder, or json file) sparse points, unless it has some; returns `points`,
-    `photographs`, `file` and `done`: False for a scene that had points.
-
-    Test photographs are left out where the scene lists those for training. Features are looked for
-    at a longest side of `size` pixels; 0 threads are all. InputError if the scene cannot be read,
-    or no points are found; ImportError without pycolmap.
-    """
+    `photographs`, `file` and `done`: False for a scene that had points. Test photographs are left
+    out where the scene lists those for training. Features are looked for at a longest side of
+    `size` pixels; 0 threads are all. InputError if the scene cannot be read, or no points are
+    found; ImportError without pycolmap."""
     check_options(size, threads)
     scene = read_scene(data)
     chosen = training_frames(scene)

@@ -65,8 +65,7 @@ class Reconstructor:
     """pycolmap on the photographs of a scene."""
 
     def __init__(self, scene: Path, photographs: Sequence[Photograph], threads: int) -> None:
-        """With the folder of the scene, whose `images` has all copies, and MASKS some masks; 0
-        threads are all."""
+        """`scene` has copies in `images`, and may have masks in MASKS; 0 threads are all."""
         self.pycolmap, self.scene, self.images = load_pycolmap(), scene, scene / "images"
         self.folder, self.database = scene / "colmap", scene / DATABASE
         self.photographs, self.threads = photographs, threads or usable_cores()
@@ -280,8 +279,7 @@ def choose_posed_pairs(poses: NDArray[np.float64]) -> Pairs:
 
 
 def capture_order(names: Sequence[str], exifs: Sequence[Exif]) -> list[int] | None:
-    """Numbers of the photographs as they were taken, by EXIF's time or as names count; None if
-    neither tells."""
+    """Numbers of the photographs as taken, by EXIF's time or their names; None if neither tells."""
     times = [each.time for each in exifs if each.time is not None]
     if len(times) == len(names) and 2 * len(set(times)) > len(names):
         return sorted(range(len(names)), key=lambda number: (exifs[number].time, names[number]))
