@@ -155,37 +155,38 @@ def fit_lens(rays: np.void) -> tuple[dict[str, float], float]:
         for far in ((y, x + 1), (y + 1, x))
     ]
     first = np.array([*focal, width / 2, height / 2])
-
-    def missed(values: Array) -> Array:
-        return (_seen(directions, values[:3], values[3:7], values[7:]) - pixels).ravel()
-
-    scale = np.array([1.0] * 3 + [float(width)] * 4)
-    fitted = least_squares(
-        missed, np.append(_turn(directions, pixels, first), first), x_scale=scale
-    )
-    if _apart(fitted.fun.reshape(-1, 2)) > STRAIGHT:
-        start = np.append(fitted.x, np.zeros(len(DISTORTION)))
-        fitted = least_squares(missed, start, x_scale=np.append(scale, np.ones(len(DISTORTION))))
-    lens = dict(zip((*INTRINSICS, *DISTORTION), map(float, fitted.x[3:])))
-    return {"w": width, "h": height, **lens}, _apart(fitted.fun.reshape(-1, 2))
+    values, error = _fit(rays, np.append(_turn(directions, pixels, first), first))
+    if error > STRAIGHT:
+        values, error = _fit(rays, np.append(values, np.zeros(len(DISTORTION))))
+    lens = dict(zip((*INTRINSICS, *DISTORTION), map(float, values[3:])))
+    return {"w": width, "h": height, **lens}, error
 
 
 def fit_pose(rays: np.void, lens: dict[str, float]) -> tuple[Array, float]:
     """The pose [4, 4] of a picture, OpenGL camera to world, and how far its rays are from those of
     that camera, in pixels (root mean square)."""
-    values = np.array([lens[name] for name in INTRINSICS])
-    distortion = np.array([lens.get(name, 0.0) for name in DISTORTION])
+    known = np.array([lens.get(name, 0.0) for name in (*INTRINSICS, *DISTORTION)])
+    pixels = _pixels(int(rays["width"]), int(rays["height"]))
+    turn, error = _fit(rays, _turn(rays["directions"].astype(float), pixels, known[:4]), known)
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec(turn).inv().as_matrix() * [1.0, -1.0, -1.0]
+    pose[:3, 3] = rays["place"]
+    return pose, error
+
+
+def _fit(rays: np.void, start: Array, known: Array | None = None) -> tuple[Array, float]:
+    """Rotation vector, then intrinsics and distortion unless `known`, that are nearest to a
+    picture's rays from a start on; and their distance in pixels (root mean square)."""
     pixels = _pixels(int(rays["width"]), int(rays["height"]))
     directions = rays["directions"].astype(float)
 
-    def missed(turn: Array) -> Array:
-        return (_seen(directions, turn, values, distortion) - pixels).ravel()
+    def missed(values: Array) -> Array:
+        lens = values[3:] if known is None else known
+        return (_seen(directions, values[:3], lens[:4], lens[4:]) - pixels).ravel()
 
-    fitted = least_squares(missed, _turn(directions, pixels, values))
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_rotvec(fitted.x).inv().as_matrix() * [1.0, -1.0, -1.0]
-    pose[:3, 3] = rays["place"]
-    return pose, _apart(fitted.fun.reshape(-1, 2))
+    scale = np.array([1.0] * 3 + [float(rays["width"])] * 4 + [1.0] * len(DISTORTION))
+    fitted = least_squares(missed, start, x_scale=scale[: len(start)])
+    return fitted.x, float(np.sqrt(np.mean(np.sum(fitted.fun.reshape(-1, 2) ** 2, axis=-1))))
 
 
 def _pixels(width: int, height: int) -> Array:
@@ -211,11 +212,6 @@ def _turn(directions: Array, pixels: Array, intrinsics: Array) -> Array:
 
 def _unit(directions: Array) -> Array:
     return directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-
-
-def _apart(offsets: Array) -> float:
-    """The root mean square of the lengths of offsets [R, n]."""
-    return float(np.sqrt(np.mean(np.sum(offsets**2, axis=-1))))
 
 
 def _read(path: Path, out: Path) -> Iterator[tuple[Any, ...]]:

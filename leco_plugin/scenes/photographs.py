@@ -14,9 +14,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, Nerfst
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from numpy.typing import NDArray
 
-from leco_plugin.scenes.frames import (
-    UP_IS_KNOWN,
-)
+from leco_plugin.scenes.frames import UP_IS_KNOWN
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.large_coordinates import ReadsNear
 from leco_plugin.scenes.photograph_files import check_images, find_file

@@ -298,12 +298,7 @@ class HeldOutPixelSampler(PixelSampler):
         `indices` [N, 3] int64 (image, row, column). `images` is a batch of the image loader:
         `image` [K, H, W, C] or a list of [H, W, C], `image_idx` [K], and `mask` if any. Where none
         of the share is left, as of tiny images, of all shares."""
-        which, within = self._held_out(images, count, seed, share)
-        numbers = torch.as_tensor(images["image_idx"]).cpu()[which]
-        return {
-            "image": look_up(images["image"], which, within),
-            "indices": torch.cat([numbers[:, None], within], dim=-1),
-        }
+        return _pixels_at(images, self._held_out(images, count, seed, share))
 
     def sample_pictures(
         self, images: dict[str, Any], chosen: Tensor, count: int, seed: int
@@ -316,38 +311,38 @@ class HeldOutPixelSampler(PixelSampler):
         for picture in (numbers[None] == chosen[:, None]).int().argmax(dim=1).tolist():
             drawn = torch.rand(DRAWN * count, 2, generator=generator) * sizes[picture]
             places = torch.nn.functional.pad(drawn.long(), (1, 0), value=picture)
-            found.append(self._visible(images, places, sizes, numbers)[:count])
-        places = torch.cat(found)
-        return {
-            "image": look_up(images["image"], places[:, 0], places[:, 1:]),
-            "indices": torch.cat([numbers[places[:, :1]], places[:, 1:]], dim=-1),
-        }
+            found.append(places[self.visible(images, places)][:count])
+        return _pixels_at(images, torch.cat(found))
 
-    def _visible(
-        self, images: dict[str, Any], places: Tensor, sizes: Tensor, numbers: Tensor
-    ) -> Tensor:
-        """Those of pixels [N, 3] (place in the batch, row, column) that no lens or mask hides."""
-        places = places[self.shown(places, sizes[places[:, 0]], numbers)]
+    def visible(self, images: dict[str, Any], places: Tensor) -> Tensor:
+        """Which pixels [N, 3] (place in the batch, row, column) no lens or mask hides: bool [N]."""
+        numbers, sizes = torch.as_tensor(images["image_idx"]).cpu(), sizes_of(images["image"])
+        seen = self.shown(places, sizes[places[:, 0]], numbers)
         if "mask" in images:
-            seen = look_up(images["mask"], places[:, 0], places[:, 1:]).flatten(1).all(dim=1)
-            places = places[seen.cpu()]
-        return places
+            masks = look_up(images["mask"], places[:, 0], places[:, 1:])
+            seen &= masks.flatten(1).all(dim=1).cpu()
+        return seen
 
     def count_held_out(self, images: dict[str, Any], most: int, share: Share) -> int:
         """How many pixels of a share there are, up to `most`; arguments as of `sample_held_out`."""
-        return len(self._held_out(images, most, 0, share)[0])
+        return len(self._held_out(images, most, 0, share))
 
-    def _held_out(
-        self, images: dict[str, Any], count: int, seed: int, share: Share
-    ) -> tuple[Tensor, Tensor]:
-        """Pictures [N] and places in them [N, 2]; arguments as of `sample_held_out`."""
+    def _held_out(self, images: dict[str, Any], count: int, seed: int, share: Share) -> Tensor:
+        """Pixels [N, 3] (place in the batch, row, column); arguments as of `sample_held_out`."""
         sizes = sizes_of(images["image"])
         places = self.lattice.draw(sizes, DRAWN * count, torch.Generator().manual_seed(seed))
-        numbers = torch.as_tensor(images["image_idx"]).cpu()
-        places = self._visible(images, places, sizes, numbers)
+        places = places[self.visible(images, places)]
         of_share = self.lattice.is_of(places, share)
-        places = places[of_share] if bool(of_share.any()) else places
-        return places[:count, 0], places[:count, 1:]
+        return (places[of_share] if bool(of_share.any()) else places)[:count]
+
+
+def _pixels_at(images: dict[str, Any], places: Tensor) -> dict[str, Tensor]:
+    """Pixels [N, 3] (place in the batch, row, column) as `PixelSampler.sample` returns them."""
+    numbers = torch.as_tensor(images["image_idx"]).cpu()
+    return {
+        "image": look_up(images["image"], places[:, 0], places[:, 1:]),
+        "indices": torch.cat([numbers[places[:, :1]], places[:, 1:]], dim=-1),
+    }
 
 
 def held_out_sampler(datamanager: Any) -> HeldOutPixelSampler | None:

@@ -12,12 +12,7 @@ from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from torch import Tensor
 
 from leco_plugin.scenes.bounds import FEWEST_POINTS
-from leco_plugin.scenes.pixels.held_out_pixels import (
-    HeldOutPixelSampler,
-    Lattice,
-    look_up,
-    sizes_of,
-)
+from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler, Lattice, look_up
 
 NEARER = 0.9
 """A point hides its neighbours in the image that are farther than it by more than this factor."""
@@ -168,21 +163,18 @@ class KnownDistancePixelSampler(HeldOutPixelSampler):
         # a batch may be of some of the images only
         place_of = torch.full((int(max(numbers.max(), pixels[:, 0].max())) + 1,), -1)
         place_of[numbers] = torch.arange(len(numbers))
-        places = place_of[pixels[:, 0]]
-        loaded = places >= 0
+        loaded = place_of[pixels[:, 0]] >= 0
         if self.set_aside is not None:
             loaded &= ~self.set_aside[pixels[:, 0]]
-        drawn, pixels, places = drawn[loaded], pixels[loaded], places[loaded]
-        seen = self.shown(pixels, sizes_of(images["image"])[places])
-        if "mask" in images:
-            seen &= look_up(images["mask"], places, pixels[:, 1:]).flatten(1).all(dim=1).cpu()
+        drawn, pixels = drawn[loaded], pixels[loaded]
+        places = torch.cat([place_of[pixels[:, :1]], pixels[:, 1:]], dim=-1)
+        seen = self.visible(images, places)
         drawn, pixels, places = drawn[seen], pixels[seen], places[seen]
         known = batch["image"].new_zeros(len(batch["indices"]), dtype=torch.float32)
         known[: len(drawn)] = sparse.distances[drawn].to(known.device)
         for key, source in images.items():
             if key in batch and key not in ("image_idx", "indices"):
-                batch[key][: len(drawn)] = look_up(source, places, pixels[:, 1:]).to(
-                    batch[key].device
-                )
+                values = look_up(source, places[:, 0], places[:, 1:])
+                batch[key][: len(drawn)] = values.to(batch[key].device)
         batch["indices"][: len(drawn)] = pixels.to(batch["indices"].device)
         batch[DISTANCE] = known
