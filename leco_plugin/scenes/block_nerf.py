@@ -143,8 +143,7 @@ def best_lens(pictures: NDArray[Any]) -> dict[str, float]:
 
 
 def fit_lens(rays: np.void) -> tuple[dict[str, float], float]:
-    """The lens of a picture's rays, and how far it is from them in pixels (root mean square);
-    without distortion where that is within a tenth of a pixel."""
+    """The lens of a picture, without distortion within `STRAIGHT`, and its distance in pixels."""
     width, height = int(rays["width"]), int(rays["height"])
     pixels, directions = _pixels(width, height), rays["directions"].astype(float)
     ends, places = directions.reshape(DOWN, ACROSS, 3), pixels.reshape(DOWN, ACROSS, 2)
@@ -163,8 +162,7 @@ def fit_lens(rays: np.void) -> tuple[dict[str, float], float]:
 
 
 def fit_pose(rays: np.void, lens: dict[str, float]) -> tuple[Array, float]:
-    """The pose [4, 4] of a picture, OpenGL camera to world, and how far its rays are from those of
-    that camera, in pixels (root mean square)."""
+    """The pose [4, 4] of a picture, OpenGL camera to world, and its rays' distance in pixels."""
     known = np.array([lens.get(name, 0.0) for name in (*INTRINSICS, *DISTORTION)])
     pixels = _pixels(int(rays["width"]), int(rays["height"]))
     turn, error = _fit(rays, _turn(rays["directions"].astype(float), pixels, known[:4]), known)
@@ -236,8 +234,7 @@ def _read(path: Path, out: Path) -> Iterator[tuple[Any, ...]]:
 
 
 def _picture(fields: dict[str, list[memoryview]]) -> tuple[Any, ...]:
-    """Name, file, camera, width, height, place, movement and directions of a picture by its
-    record's fields. ValueError or LookupError if one is missing or wrong."""
+    """A row of `RAYS` but for `test`, after its file. ValueError, LookupError for what is wrong."""
     camera, known, width, height = (
         _varint(fields[name][0])[0] for name in ("cam_idx", "image_hash", "width", "height")
     )

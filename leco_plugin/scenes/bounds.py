@@ -82,12 +82,9 @@ def find_bounds(
     points: Tensor | None,
     config: BoundsConfig | None = None,
 ) -> SceneBounds:
-    """Bounds from camera poses, some of the cameras' rays, and sparse points.
-
-    Poses [C, 3, 4] are OpenGL's, in scene units; unit directions [C, K, 3] cover each image, its
-    corners included; points are [P, 3] or None. InputError if a pose is not finite, no camera sees
-    a point, or configured altitudes are no range that rays go down to.
-    """
+    """Bounds from poses [C, 3, 4], OpenGL's, in scene units, unit directions [C, K, 3] that cover
+    each image, its corners included, and points [P, 3] or None. InputError if a pose is not finite,
+    no camera sees a point, or configured altitudes are no range that rays go down to."""
     config = config or BoundsConfig()
     poses, directions = (part.detach().float().cpu() for part in (camera_to_worlds, directions))
     if not bool(poses.isfinite().all()):
@@ -168,11 +165,8 @@ def with_range(bounds: SceneBounds, near: float | None, far: float | None) -> Sc
 
 
 def raise_to_cameras(bounds: SceneBounds, heights: Tensor, seen: float) -> SceneBounds:
-    """The bounds of a scene from above, raised to its cameras, of heights z [C].
-
-    It is for pictures in which rays that miss what the sparse points bound show something (`seen`,
-    a share of all rays): fog, which has no points, or a sky.
-    """
+    """The bounds of a scene from above, raised to its cameras, of heights z [C]: for pictures in
+    which rays beyond the sparse points show something (`seen`, a share of all), as fog or a sky."""
     ground, highest = float(bounds.aabb[2]), float(heights.max())
     top = max(float(bounds.aabb[5]), highest + OVER_CAMERAS * (highest - ground))
     x, y = bounds.center[:2].tolist()

@@ -23,7 +23,7 @@ from leco_plugin.scenes.frames import (
     parsed_frame,
 )
 from leco_plugin.scenes.input_error import InputError, one_line
-from leco_plugin.scenes.lenses import lens_of
+from leco_plugin.scenes.lenses import bend, lens_of
 from leco_plugin.scenes.photograph_files import find_file
 from leco_plugin.scenes.scene_file import (
     NO_SCENE,
@@ -134,8 +134,7 @@ def read_cloud(path: Path) -> PointCloud:
 
 
 def coloured_points(description: Path) -> PointCloud | None:
-    """Sparse points with colours that a transforms.json names, or None. InputError if they cannot
-    be read."""
+    """Sparse points with colours that a transforms.json names, or None. InputError for bad ones."""
     name = load_json(description).get("ply_file_path")
     path = find_file(description.parent / str(name))
     if name is None or not path.is_file():
@@ -182,28 +181,15 @@ def views_of(description: Path, places: NDArray[np.float64]) -> NDArray[np.int64
                 return None
             size = np.array([lens.width, lens.height])
             focal = np.array(lens.focal_lengths(lens.width, lens.height, 1), dtype=np.float64)
-            centre = size / 2 if lens.cx is None or lens.cy is None else [lens.cx, lens.cy]
-            k1, k2, *_ = lens.distortion or (0.0, 0.0)
-            local = (places - pose[:3, 3]) @ pose[:3, :3]
-            ahead = -local[:, 2]
-            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-                slopes = local[:, :2] * [1.0, -1.0] / ahead[:, None]
-                bent, folded = _bend(slopes, k1, k2)
-                pixels = np.add(centre, focal * bent)
+            local = torch.from_numpy((places - pose[:3, 3]) @ pose[:3, :3])
+            slopes, ahead = local[:, :2] / -local[:, 2:], local[:, 2] < 0.0
+            bent, sharp = bend(slopes * torch.tensor([1.0, -1.0]), lens.distortion)
+            pixels = np.array([lens.cx, lens.cy]) + focal * bent.numpy()
             inside = (pixels >= -WIDER * size) & (pixels <= (1.0 + WIDER) * size)
-            counts += inside.all(axis=1) & (ahead > 0.0) & ~folded
+            counts += inside.all(axis=1) & (ahead & sharp).numpy()
     except (KeyError, TypeError, ValueError, IndexError):
         return None
     return counts
-
-
-def _bend(
-    slopes: NDArray[np.float64], k1: float, k2: float
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Slopes [N, 2] bent by a lens with radial distortion, and where it folds them back: [N]."""
-    squares = (slopes**2).sum(axis=1)
-    factor = 1.0 + k1 * squares + k2 * squares**2
-    return slopes * factor[:, None], 1.0 + 3.0 * k1 * squares + 5.0 * k2 * squares**2 <= 0.0
 
 
 def georeference(description: Path) -> dict[str, Any]:

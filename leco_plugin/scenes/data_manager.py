@@ -94,8 +94,7 @@ class LecoDataManager(Vanilla):  # type: ignore[type-arg]
         return dataset
 
     def _get_pixel_sampler(self, dataset: Any, num_rays_per_batch: int) -> Any:
-        """nerfstudio's choice; of small scenes more pixels are held out, and the radius of a
-        fisheye's circle is given by hand, or that of the full-size image."""
+        """nerfstudio's choice, with the lattice and the fisheyes' radius that its images need."""
         by_hand = self.config.pixel_sampler.fisheye_crop_radius
         sampler = super()._get_pixel_sampler(dataset, num_rays_per_batch)
         of_scene = (dataset.cameras.metadata or {}).get("fisheye_crop_radius")

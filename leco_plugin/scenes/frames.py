@@ -23,8 +23,7 @@ from leco_plugin.scenes.input_error import InputError
 
 
 def frame_of(datamanager: Any) -> list[list[float]] | None:
-    """What took the scene's coordinates to the model's: [3, 4], JSON values; None is not known. The
-    scene's are those before any `applied_transform`, the same for all readers."""
+    """What took the scene's coordinates, before any `applied_transform`, to the model's: [3, 4]."""
     outputs = getattr(datamanager, "train_dataparser_outputs", None)
     return None if outputs is None else parsed_frame(outputs).tolist()
 

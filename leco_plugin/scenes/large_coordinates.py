@@ -151,8 +151,7 @@ class ReadsNear(DataParser):
 
 
 def _has_points(model: Path) -> bool:
-    """Whether a model of COLMAP may have points: False where their file is not there, or whole and
-    of none."""
+    """Whether a COLMAP model may have points: their file is there, not whole and empty."""
     if (file := model / "points3D.bin").exists():
         return file.stat().st_size != COUNT_BYTES or any(file.read_bytes())
     if not (file := model / "points3D.txt").exists():

@@ -140,11 +140,7 @@ class LearningData:
     def training_rays(self, mixture: Mixture, count: int, set_aside: int = 0) -> Rays:
         """Rays [count] of training pixels, cut to a mixture's region; as of `prepare_batch`."""
         self.prepare_batch(1.0, distances=False, set_aside=set_aside)
-        drawn: list[Rays] = []
-        for bundle in training_bundles(self.manager, count):
-            bundle = bundle.to(mixture.device)
-            images = bundle.camera_indices[:, 0]
-            drawn.append(mixture.rays(bundle.origins, bundle.directions, images))
+        drawn = [_rays_of(mixture, each) for each in training_bundles(self.manager, count)]
         self.prepare_batch(1.0, distances=False)
         joined: Any = [None if p[0] is None else torch.cat(p)[:count] for p in zip(*drawn)]
         return Rays(*joined)
@@ -219,11 +215,13 @@ def held_out_rays(
 
 def _as_rays(mixture: Mixture, bundle: RayBundle, truth: Tensor) -> tuple[Rays, Tensor]:
     """Rays as a mixture takes them, and their colours [R, 3]."""
-    bundle, truth = bundle.to(mixture.device), truth.to(mixture.device).float()
-    images = bundle.camera_indices
-    assert images is not None
-    rays = mixture.rays(bundle.origins, bundle.directions, images[:, 0])
-    return rays, on_black(truth)
+    return _rays_of(mixture, bundle), on_black(truth.to(mixture.device).float())
+
+
+def _rays_of(mixture: Mixture, bundle: RayBundle) -> Rays:
+    bundle = bundle.to(mixture.device)
+    assert bundle.camera_indices is not None
+    return mixture.rays(bundle.origins, bundle.directions, bundle.camera_indices[:, 0])
 
 
 def count_held_out(manager: Any, limit: int) -> float:

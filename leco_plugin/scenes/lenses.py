@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, Cameras, CameraType
+from torch import Tensor
 
 from leco_plugin.scenes.input_error import InputError
 
@@ -31,11 +32,13 @@ MIXED = {CameraType.PERSPECTIVE, CameraType.FISHEYE}
 FISHEYES = {CameraType.FISHEYE, CameraType.FISHEYE624}
 UNDISTORTED = {CameraType.PERSPECTIVE, *FISHEYES}
 """Types for whose rays nerfstudio undoes the distortion."""
+FAR_OUTSIDE = 4.0
+"""Square of the normalised radius beyond which no image shows anything."""
 
 
 @dataclass(frozen=True)
 class Lens:
-    """The lens of a frame in pixels of its full size; None is not said."""
+    """The lens of a frame in pixels of its full size, by default in its middle; None: not said."""
 
     kind: CameraType | None
     fx: float | None
@@ -88,6 +91,8 @@ def lens_of(meta: dict[str, Any], frame: dict[str, Any], where: str) -> Lens:
     if given:
         remedy = "give focal lengths and cx, cy in pixels, not in shares"
         raise InputError(f"{where}: {given}: {remedy}")
+    cx = width / 2 if cx is None and width is not None else cx
+    cy = height / 2 if cy is None and height is not None else cy
     radius = said("fisheye_crop_radius") if kind in FISHEYES else None
     return Lens(kind, fx, fy, cx, cy, width, height, distortion, angle_x, angle_y, radius)
 
@@ -101,11 +106,8 @@ def set_lenses(cameras: Cameras, lenses: list[Lens | None], factor: int) -> None
         if lens is None:
             continue
         size = float(cameras.width[number]), float(cameras.height[number])
-        middle = [
-            full / 2 if place is None and full is not None else place
-            for place, full in ((lens.cx, lens.width), (lens.cy, lens.height))
-        ]
-        values = (*lens.focal_lengths(*size, factor), *(p and p / factor for p in middle))
+        middle = (place and place / factor for place in (lens.cx, lens.cy))
+        values = (*lens.focal_lengths(*size, factor), *middle)
         for name, value in zip(("fx", "fy", "cx", "cy"), values):
             if value is not None:
                 getattr(cameras, name)[number] = value
@@ -120,6 +122,23 @@ def set_lenses(cameras: Cameras, lenses: list[Lens | None], factor: int) -> None
         cameras.metadata = (cameras.metadata or {}) | {"fisheye_crop_radius": radius}
     elif cameras.metadata is not None:
         cameras.metadata.pop("fisheye_crop_radius", None)
+
+
+def bend(slopes: Tensor, distortion: list[float] | None) -> tuple[Tensor, Tensor]:
+    """Normalised image places [N, 2], x and y, as a lens distorts them (`DISTORTIONS`, OpenCV's),
+    and whether it shows them: bool [N]. Radial distortion that no longer grows with the radius
+    folds what is beyond back into the image. Far outside of any image places are left unbent."""
+    k1, k2, k3, k4, p1, p2 = distortion or [0.0] * len(DISTORTIONS)
+    (x, y), r = slopes.unbind(dim=-1), slopes.square().sum(dim=-1)
+    radial = 1.0 + r * (k1 + r * (k2 + r * (k3 + r * k4)))
+    bent_x = x * radial + 2.0 * p1 * x * y + p2 * (r + 2.0 * x * x)
+    bent_y = y * radial + 2.0 * p2 * x * y + p1 * (r + 2.0 * y * y)
+    bent = torch.stack([bent_x, bent_y], dim=-1)
+    powers, squares = torch.arange(1, 5), torch.linspace(0.0, FAR_OUTSIDE, 1001)
+    growth = (2 * powers + 1) * torch.tensor([k1, k2, k3, k4]) * squares[:, None] ** powers
+    folded = squares[1.0 + growth.sum(dim=1) <= 0.0]
+    folds_at = float(folded[0]) if len(folded) else math.inf
+    return torch.where((r < FAR_OUTSIDE)[:, None], bent, slopes), r < folds_at
 
 
 def check_together(lenses: list[Lens], where: str) -> None:

@@ -217,7 +217,7 @@ def read_coordinates(path: Path) -> Coordinates:
     """`coordinates.pt`. InputError if it does not say what it should."""
     values = _read(path, "so this is no Mega-NeRF scene")
     origin = _numbers(path, values, "origin_drb", (3,))
-    metres = _number(path, values, "pose_scale_factor")
+    metres = float(_numbers(path, values, "pose_scale_factor"))
     if not (np.isfinite(metres) and metres > 0):
         raise InputError(f"{path}: pose_scale_factor is {metres:g}, and must be above 0")
     return Coordinates(origin, metres)
@@ -259,36 +259,27 @@ def _read(path: Path, otherwise: str) -> dict[str, Any]:
     return values
 
 
-def _numbers(path: Path, values: dict[str, Any], name: str, shape: tuple[int, ...]) -> Array:
-    """A finite tensor of a known shape, float64."""
-    value, wanted = _value(path, values, name), " x ".join(str(n) for n in shape)
-    if not isinstance(value, torch.Tensor) or tuple(value.shape) != shape:
-        raise InputError(f"{path}: {name} is {describe(value)}, and not {wanted} numbers")
-    numbers: Array = value.detach().double().numpy().copy()
-    if not np.isfinite(numbers).all():
+def _numbers(path: Path, values: dict[str, Any], name: str, shape: tuple[int, ...] = ()) -> Array:
+    """A finite tensor of a known shape, float64; without a shape any number."""
+    if name not in values:
+        raise InputError(f"{path} has no {name}")
+    value = values[name]
+    size = value.shape if isinstance(value, torch.Tensor) else torch.Size()
+    if size.numel() != 1 if not shape else tuple(size) != shape:
+        wanted = f"{' x '.join(map(str, shape))} numbers" if shape else "a number"
+        raise InputError(f"{path}: {name} is {describe(value)}, and not {wanted}")
+    try:
+        numbers = torch.as_tensor(value, dtype=torch.float64).detach().reshape(shape).numpy().copy()
+    except (OverflowError, RuntimeError):
+        raise InputError(f"{path}: {name} is too large a number") from None
+    if shape and not np.isfinite(numbers).all():
         raise InputError(f"{path}: {name} holds values that are not finite")
     return numbers
 
 
-def _value(path: Path, values: dict[str, Any], name: str) -> Any:
-    if name not in values:
-        raise InputError(f"{path} has no {name}")
-    return values[name]
-
-
-def _number(path: Path, values: dict[str, Any], name: str) -> float:
-    value = _value(path, values, name)
-    if isinstance(value, torch.Tensor) and value.numel() != 1:
-        raise InputError(f"{path}: {name} is {describe(value)}, and not a number")
-    try:
-        return float(value.detach() if isinstance(value, torch.Tensor) else value)
-    except OverflowError:
-        raise InputError(f"{path}: {name} is too large a number") from None
-
-
 def _side(path: Path, values: dict[str, Any], name: str) -> int:
     """A number of pixels."""
-    value = _number(path, values, name)
+    value = float(_numbers(path, values, name))
     if not (1 <= value <= _MOST_PIXELS and value == int(value)):
         raise InputError(f"{path}: {name} is {value:g}, and not a number of pixels")
     return int(value)

@@ -1,12 +1,6 @@
-"""What nerfstudio is told of a Mega-NeRF scene: cameras, pictures, masks, points and altitudes.
-
-The model's coordinates are (right, forward, up) in units of `pose_scale_factor` metres. The
-dataparser's transform leads from metres (down, right, back), as in the files, to them.
-
-In the protocol `half` the pictures of the validation set are trained on with their left halves and
-scored with their right halves. Those are pictures of their own here, with cameras of half the
-width, so that any model is scored in this way.
-"""
+"""What nerfstudio is told of a Mega-NeRF scene: cameras, pictures, masks, points and altitudes. In
+the protocol `half` the right halves of validation pictures are scored: pictures of their own, with
+cameras of half the width, so that any model is scored in this way."""
 
 from __future__ import annotations
 

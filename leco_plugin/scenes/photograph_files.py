@@ -208,8 +208,7 @@ def is_turned(header: Header, size: tuple[int, int]) -> bool:
 
 
 def decode(path: Path, turn: bool) -> Image.Image:
-    """The plain colours of an image, turned as EXIF says if asked; its EXIF stays as it was.
-    InputError if it cannot be read."""
+    """Plain colours, turned as EXIF says if asked; EXIF stays as it was. InputError if damaged."""
     try:
         with opened(path) as image:
             image.load()  # Pillow itself turns TIFF here

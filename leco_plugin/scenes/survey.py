@@ -204,9 +204,8 @@ def covering_rays(
 
 
 def doubtful_cameras(dataset: Any) -> list[str]:
-    """Lines on a dataset's cameras whose poses may be wrong: those much farther from the middle
-    than most, which squeeze all others into a small part of the scene; and others with no sparse
-    point in their field of view, which make its bounds as wide as they are away."""
+    """Lines on cameras whose poses may be wrong: far from the middle, which squeezes all others
+    into a small part of the scene, or in view of no sparse point, which widens the bounds."""
     poses, lines = dataset.cameras.camera_to_worlds, []
     times = distances_from_middle(poses[:, :3, 3].double().cpu())
     far = (times > FAR_CAMERA).nonzero().flatten().tolist()
@@ -300,9 +299,8 @@ def detail_of(
 
 
 def _pixels_on_surface(places: Tensor, density: Tensor, size: float) -> float:
-    """The density of pixels [P], integrated over the surface on which places [P, 3] lie: as large
-    as one side of each cubic cell that it passes through, of at least `size`, and just large enough
-    for most to hold `NEIGHBOURS` places."""
+    """The density of pixels [P], integrated over the surface of places [P, 3]: one side of each
+    cubic cell that holds any, of at least `size`, so large that most hold `NEIGHBOURS`."""
     low = places.amin(dim=0)
     widest = max(size, float((places.amax(dim=0) - low).max()))
     while True:
@@ -316,9 +314,8 @@ def _pixels_on_surface(places: Tensor, density: Tensor, size: float) -> float:
 
 
 def _pixel_density(places: Tensor, pose: Tensor, rays: Tensor, width: int) -> Tensor:
-    """Pixels of a camera (pose [3, 4], unit rays [K, 3] that cover its image, width in pixels) for
-    a unit of area that faces it at places [P, 3]: one over the square of a pixel's footprint, [P];
-    0 outside of the image."""
+    """Pixels of a camera (pose [3, 4], unit rays [K, 3] that cover its image, width in pixels) on a
+    unit of area at places [P, 3] that faces it: [P], 0 outside of the image."""
     turn = pose[:, :3]
     local = rays @ turn
     # behind a fisheye's axis there is no tangent

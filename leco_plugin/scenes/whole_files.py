@@ -146,8 +146,7 @@ LOCK = ".running"
 
 @contextmanager
 def alone_in(folder: Path, work: str) -> Iterator[None]:
-    """Makes a folder, and keeps other processes from the same `work` in it. InputError if one is at
-    work there, or nothing can be written there."""
+    """Makes a folder, and keeps others from the same `work` in it. InputError if one is at it."""
     with writing_into(folder, "--out"):
         folder.mkdir(parents=True, exist_ok=True)
         held = lock(folder)

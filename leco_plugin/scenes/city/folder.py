@@ -11,8 +11,7 @@ sparse_pc.ply      some visible surface points, like those of structure from mot
 
 As a Mega-NeRF scene: see `mega_nerf_files`.
 
-`CityTruth` reads it as a model sees it. nerfstudio moves and shrinks a scene before: x_model =
-scale * (R x + t), with [R | t] the dataparser's transform. There the way back is taken.
+`CityTruth` reads it as a model sees it: turned, moved and scaled by nerfstudio's dataparser.
 """
 
 from __future__ import annotations
@@ -39,6 +38,7 @@ import leco_plugin
 from leco_plugin.log import for_each
 from leco_plugin.scenes.city.cameras import CaptureConfig, Lens, View, views_of
 from leco_plugin.scenes.city.city import DESCRIPTION, City, CityConfig, read_description
+from leco_plugin.scenes.frames import inverse, moved, parsed_frame
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.mega_nerf_files import (
     TO_DRB,
@@ -184,13 +184,10 @@ def write_city(
     capture: CaptureConfig,
     layout: LayoutName = "nerfstudio",
 ) -> Path:
-    """Writes the city as a scene into `out_dir`, unless it already holds just that; returns it.
-
-    The folder appears under its name only when it is complete. Until then the pictures lie in a
-    hidden folder beside it; a run that was killed is taken up there, and several may work on it.
-    FileExistsError if `out_dir` holds something else, ValueError if it holds a damaged city or
-    cannot be replaced; all leave it alone.
-    """
+    """Writes the city as a scene into `out_dir`, unless it already holds just that; returns it. The
+    folder appears under its name only when it is complete. Until then a hidden folder beside it has
+    the pictures; a run that was killed is taken up there, and several may work on it.
+    FileExistsError if `out_dir` holds something else, ValueError for a damaged city."""
     parts = {"city": dataclasses.asdict(config), "capture": dataclasses.asdict(capture)}
     wanted = {"format": 1, **parts, "layout": layout}
     text = json.dumps(wanted, indent=2) + "\n"
@@ -310,32 +307,27 @@ class CityTruth:
 
     city: City
     folder: Path
-    transform: Tensor
-    """[3, 4] from metres to model axes, before scaling."""
+    frame: Tensor
+    """[3, 4] float64, from metres to the model."""
     scale: float
     """Model units in a metre."""
 
     @classmethod
     def from_dataparser(cls, folder: Path, outputs: Any) -> CityTruth:
-        """From a city's folder and nerfstudio's `DataparserOutputs` for it. ValueError or OSError
-        if the folder holds no city."""
-        transform = outputs.dataparser_transform.double().cpu()
+        """The truth of a city's folder that nerfstudio has read. ValueError or OSError for none."""
+        frame = parsed_frame(outputs).cpu()
         if read_description(folder)["layout"] == "mega-nerf":
-            turn = torch.from_numpy(TO_DRB)  # that reader begins at (down, right, back)
-            transform = torch.cat([transform[:, :3] @ turn, transform[:, 3:]], dim=1)
-        return cls(City.from_folder(folder), folder, transform, float(outputs.dataparser_scale))
+            # that reader begins at (down, right, back)
+            frame[:, :3] = frame[:, :3] @ torch.from_numpy(TO_DRB)
+        return cls(City.from_folder(folder), folder, frame, float(outputs.dataparser_scale))
 
     def to_metres(self, positions: Tensor) -> NDArray[np.float64]:
         """Model positions [..., 3] in metres: float64 [..., 3]."""
-        rotation, shift = self.transform[:, :3], self.transform[:, 3]
-        return (
-            (positions.detach().double().cpu() / self.scale - shift) @ torch.linalg.inv(rotation).T
-        ).numpy()
+        return moved(positions.detach().double().cpu(), inverse(self.frame)).numpy()
 
     def to_model(self, positions: NDArray[np.floating]) -> Tensor:
         """Positions [..., 3] in metres as model positions: float32 [..., 3]."""
-        metres = torch.as_tensor(positions, dtype=torch.float64)
-        return (self.scale * (metres @ self.transform[:, :3].T + self.transform[:, 3])).float()
+        return moved(torch.as_tensor(positions, dtype=torch.float64), self.frame).float()
 
     def occupied(self, positions: Tensor) -> Tensor:
         """Whether model positions [..., 3] lie inside solid matter: bool [...]."""

@@ -98,7 +98,7 @@ def plan_city(
         canvas.build(shapes, GROUND_DEPTH)
         _streets(block, size, street)
     _wires(shapes, built, middle, lot, metal)
-    _edge(shapes, built, middle, size, seed, palette)
+    _edge(shapes, built, size, seed, palette)
     if far_terrain:
         _terrain(shapes, palette, float(np.abs(middle).max() + size), seed)
     return shapes, palette
@@ -190,12 +190,7 @@ def _sagging(poles: Array, height: float, sag: float = 0.5, parts: int = 3) -> A
 
 
 def _edge(
-    shapes: Shapes,
-    built: NDArray[np.bool_],
-    middle: Array,
-    size: float,
-    seed: int,
-    palette: Palette,
+    shapes: Shapes, built: NDArray[np.bool_], size: float, seed: int, palette: Palette
 ) -> None:
     """Aprons of irregular depth wherever a block has no neighbour: the outline of the city."""
     verge = palette.add(Material.GRASS, (0.45, 0.46, 0.24))

@@ -60,8 +60,7 @@ class Lattice:
         return checks if share == "recheck" else ~checks
 
     def counts(self, sizes: Tensor) -> Tensor:
-        """Held-out pixels of pictures of sizes [P, 2] (height, width): [P, 2] (rows, columns). Of
-        a picture that is too small for one, its last counts."""
+        """Rows and columns [P, 2] of held-out pixels, one at least, of sizes [P, 2]."""
         return ((sizes - self.offset - 1) // self.period + 1).clamp(min=1)
 
     def draw(self, sizes: Tensor, count: int, generator: torch.Generator) -> Tensor:
@@ -203,9 +202,8 @@ class HeldOutPixelSampler(PixelSampler):
         return batch
 
     def shown(self, pixels: Tensor, sizes: Tensor, numbers: Tensor | None = None) -> Tensor:
-        """Whether a fisheye shows pixels (image, row, column) [N, 3] as a whole: bool [N]. Sizes
-        (height, width) are [2] or [N, 2]; `numbers` are the dataset's, where pixels name pictures
-        by their place in a batch."""
+        """Whether a fisheye shows pixels (image, row, column) [N, 3]: bool [N]. Sizes (height,
+        width) are [2] or [N, 2]; `numbers` are the dataset's, of images numbered by batch."""
         radius: Any = self.config.fisheye_crop_radius
         if self.radii is not None:
             images = pixels[:, 0].cpu()

@@ -12,6 +12,7 @@ from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from torch import Tensor
 
 from leco_plugin.scenes.bounds import FEWEST_POINTS
+from leco_plugin.scenes.lenses import bend
 from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler, Lattice, look_up
 
 NEARER = 0.9
@@ -34,8 +35,7 @@ class SparsePixels(NamedTuple):
 
 
 def sparse_pixels(cameras: Cameras, points: Tensor, lattice: Lattice) -> SparsePixels:
-    """Projects sparse points [P, 3] into the perspective cameras of one frame and keeps what is
-    seen; held-out pixels are left out."""
+    """Where perspective cameras see sparse points [P, 3], but for pixels that are held out."""
     cameras = cameras.to("cpu")
     points = _at_most(MOST_POINTS, points.detach().float().cpu())
     for_each_image = MOST_PIXELS // max(len(cameras), 1)
@@ -71,37 +71,15 @@ def project(cameras: Cameras, number: int, points: Tensor) -> tuple[Tensor, Tens
     pose = cameras.camera_to_worlds[number]
     local = (points - pose[:, 3]) @ pose[:, :3]
     ahead = -local[:, 2]
-    x, y = (local[:, :2] / ahead.clamp(min=1e-9)[:, None]).unbind(dim=-1)
-    y, seen = -y, ahead > 0
+    slopes = local[:, :2] / ahead.clamp(min=1e-9)[:, None] * torch.tensor([1.0, -1.0])
+    seen = ahead > 0
     if cameras.distortion_params is not None:
-        params = cameras.distortion_params[number]
-        seen = seen & (x * x + y * y < folds_at(params))
-        x, y = distort(x, y, params)
-    rows = cameras.cy[number] + cameras.fy[number] * y
-    columns = cameras.cx[number] + cameras.fx[number] * x
+        slopes, sharp = bend(slopes, cameras.distortion_params[number].tolist())
+        seen = seen & sharp
+    rows = cameras.cy[number] + cameras.fy[number] * slopes[:, 1]
+    columns = cameras.cx[number] + cameras.fx[number] * slopes[:, 0]
     lengths = local.norm(dim=-1)
     return torch.stack([rows, columns], dim=-1), torch.where(seen, lengths, -lengths)
-
-
-def distort(x: Tensor, y: Tensor, params: Tensor) -> tuple[Tensor, Tensor]:
-    """Radial and tangential distortion of normalised image places (OpenCV: k1 k2 k3 k4 p1 p2),
-    meant for the field of view only: far outside of it places are left unbent."""
-    k1, k2, k3, k4, p1, p2 = params.tolist()
-    r = x * x + y * y
-    radial = 1.0 + r * (k1 + r * (k2 + r * (k3 + r * k4)))
-    bent_x = x * radial + 2.0 * p1 * x * y + p2 * (r + 2.0 * x * x)
-    bent_y = y * radial + 2.0 * p2 * x * y + p1 * (r + 2.0 * y * y)
-    near = r < 4.0
-    return torch.where(near, bent_x, x), torch.where(near, bent_y, y)
-
-
-def folds_at(params: Tensor) -> float:
-    """The squared normalised radius from which on radial distortion (OpenCV: k1 k2 k3 k4) no longer
-    grows, and two places share a pixel. Infinite where that is outside of any image."""
-    powers, squares = torch.arange(1, 5), torch.linspace(0.0, 4.0, 1001)
-    slopes = 1.0 + ((2 * powers + 1) * params[:4].cpu() * squares[:, None] ** powers).sum(dim=1)
-    folded = squares[slopes <= 0.0]
-    return float(folded[0]) if len(folded) else math.inf
 
 
 def hidden(pixels: Tensor, lengths: Tensor, height: int, width: int) -> Tensor:

@@ -196,9 +196,8 @@ def _seen(scene: SceneFile, number: int, path: Path, image: Image.Image) -> Imag
 
 
 def camera_of(lens: Lens, full: tuple[int, int], size: tuple[int, int], where: str) -> Any:
-    """A camera of pycolmap: a lens in pixels of its full size (width, height), scaled to the size
-    of a copy. InputError for other lenses than perspective and fisheye, without focal length, or
-    with a distortion that pycolmap's cameras lack."""
+    """A camera of pycolmap, for a copy of a size, of a lens in pixels of its full size (width,
+    height). InputError without a focal length, or for a lens that pycolmap lacks."""
     focal = lens.focal_lengths(*full, factor=1)
     if lens.kind not in (None, *MIXED) or focal[0] is None or focal[1] is None:
         raise InputError(
