@@ -234,7 +234,7 @@ def _read(path: Path, out: Path) -> Iterator[tuple[Any, ...]]:
 
 
 def _picture(fields: dict[str, list[memoryview]]) -> tuple[Any, ...]:
-    """A row of `RAYS` but for `test`, after its file. ValueError, LookupError for what is wrong."""
+    """Name, file, and the rest of a row of `RAYS` but `test`. ValueError, LookupError if wrong."""
     camera, known, width, height = (
         _varint(fields[name][0])[0] for name in ("cam_idx", "image_hash", "width", "height")
     )
