@@ -1,5 +1,4 @@
-"""What a scene's files say of places, in their coordinates: colours of sparse points nearby, and
-photographs that show them."""
+"""What a scene's files say of places: colours of points nearby, photographs that show them."""
 
 from __future__ import annotations
 

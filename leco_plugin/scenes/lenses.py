@@ -57,8 +57,7 @@ class Lens:
     def focal_lengths(
         self, width: float, height: float, factor: int
     ) -> tuple[float, float] | tuple[None, None]:
-        """Both focal lengths in pixels of a picture of that size, smaller by `factor` than the lens
-        is for; None where nothing is said."""
+        """Focal lengths in pixels of a picture smaller by `factor`; None of an unknown lens."""
         across = self.fx, self.angle_x, width if self.width is None else self.width / factor
         down = self.fy, self.angle_y, height if self.height is None else self.height / factor
         found = [

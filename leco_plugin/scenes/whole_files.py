@@ -107,8 +107,7 @@ def check_place(option: str, path: Path | None) -> None:
 
 
 def check_apart(written: Mapping[str, Path | None], *read: Path | None) -> None:
-    """InputError if a file to write, known by its option, is one that a command reads, or another
-    that it writes. Of a scene's folder the transforms.json is read."""
+    """InputError if a file to write, by its option, is one that a command reads or writes twice."""
     known = [path for path in read if path is not None]
     taken = {path.resolve() for each in known for path in (each, each / "transforms.json")}
     for option, path in written.items():

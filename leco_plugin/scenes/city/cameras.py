@@ -128,12 +128,10 @@ class Lens:
 
 @dataclass(frozen=True)
 class CaptureConfig:
-    """How a city is photographed. ValueError for what cannot be taken."""
+    """How a city is photographed, sizes in pixels. ValueError for what cannot be taken."""
 
     width: int = 160
-    """Width of the pictures in pixels."""
     height: int = 120
-    """Height of the pictures in pixels."""
     field_of_view: float = 60.0
     """Horizontal opening angle in degrees."""
     aerial_per_block: float = 8.5

@@ -162,18 +162,15 @@ DESCRIPTION = "city.json"
 
 @dataclass(frozen=True)
 class CityConfig:
-    """Everything that determines a city. ValueError for what cannot be built."""
+    """What determines a city, as `leco city` asks for it. ValueError for what cannot be built."""
 
     blocks: int = 3
     """The city covers blocks x blocks blocks, some of them missing at the rim."""
     seed: int = 0
-    """Another seed, another city."""
     block_size: float = 40.0
     """From one street's middle to the next, in metres."""
     sky: bool = False
-    """A sky behind the city; without it, rays that miss are transparent."""
     far_terrain: bool = False
-    """A plain around the city and hills at several times its size."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.blocks <= 64:
