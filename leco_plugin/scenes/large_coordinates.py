@@ -141,6 +141,7 @@ class ReadsNear(DataParser):
     def _points(self, path: Path) -> Array:
         """Shifted sparse points [P, 3] of a .ply, or of the folder of a COLMAP model."""
         if not path.is_dir():
+            assert self.shift is not None
             return read_cloud(path).positions - self.shift
         read, name = colmap_parsing_utils.read_points3D_binary, "points3D.bin"
         if not (path / name).exists():

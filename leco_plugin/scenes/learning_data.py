@@ -138,7 +138,7 @@ class LearningData:
         return held_out_rays(mixture, self.manager, count, seed, share)
 
     def training_rays(self, mixture: Mixture, count: int, set_aside: int = 0) -> Rays:
-        """Rays [count] of training pixels, cut to a mixture's region; as of `prepare_batch`."""
+        """Rays [count] of training pixels, cut to a mixture's region; `set_aside` is for these."""
         self.prepare_batch(1.0, distances=False, set_aside=set_aside)
         drawn = [_rays_of(mixture, each) for each in training_bundles(self.manager, count)]
         self.prepare_batch(1.0, distances=False)

@@ -265,7 +265,8 @@ def _numbers(path: Path, values: dict[str, Any], name: str, shape: tuple[int, ..
         raise InputError(f"{path} has no {name}")
     value = values[name]
     size = value.shape if isinstance(value, torch.Tensor) else torch.Size()
-    if size.numel() != 1 if not shape else tuple(size) != shape:
+    fits = tuple(size) == shape if shape else size.numel() == 1
+    if not fits:
         wanted = f"{' x '.join(map(str, shape))} numbers" if shape else "a number"
         raise InputError(f"{path}: {name} is {describe(value)}, and not {wanted}")
     try:
