@@ -140,7 +140,6 @@ class LecoDataManager(Vanilla):  # type: ignore[type-arg]
         return itertools.repeat(store_pictures(dataset, folder, what))
 
     def setup_train(self) -> None:
-        """Sets up what training rays are drawn from."""
         if not self.on_disk():
             super().setup_train()
             return

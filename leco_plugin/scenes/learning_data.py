@@ -146,7 +146,6 @@ class LearningData:
         return Rays(*joined)
 
     def count_held_out(self, limit: int) -> float:
-        """How many pixels there are to check with, up to a limit; endless if none is held out."""
         return count_held_out(self.manager, limit)
 
     def doubts(self) -> list[str]:

@@ -287,7 +287,6 @@ def _side(path: Path, values: dict[str, Any], name: str) -> int:
 
 
 def write_coordinates(folder: Path, coordinates: Coordinates) -> None:
-    """Writes `coordinates.pt`."""
     values = {
         "origin_drb": torch.from_numpy(coordinates.origin_drb).float(),
         "pose_scale_factor": float(coordinates.metres),

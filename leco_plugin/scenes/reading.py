@@ -179,7 +179,6 @@ def _remedy(error: BaseException, config: Any) -> str:
 
 
 def _lacks_its_file(error: BaseException, config: Any) -> bool:
-    """Whether a reader failed because the file that it looks for is not there."""
     if description_of(config, "train") is not None:
         return False  # it has been read
     data, name = Path(config.data), reader_name(config)

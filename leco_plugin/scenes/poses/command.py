@@ -187,7 +187,6 @@ def _put_in_the_world(pycolmap: Any, model: Any, gps: dict[str, Any], altitudes:
 
 
 def _report(models: list[Any], sources: dict[str, str], placement: Placement) -> dict[str, Any]:
-    """What came of the photographs: JSON values."""
     blocks = [{sources[name] for name in poses_of(model)[0]} for model in models]
     lost = sorted({*sources.values()} - blocks[0])
     residuals = placement.residuals
