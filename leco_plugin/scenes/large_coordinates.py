@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from leco_plugin.log import say
-from leco_plugin.scenes.coloured_points import read_cloud
 from leco_plugin.scenes.frames import APPLIED, applied_in, inverse, moved, parsed_frame
 from leco_plugin.scenes.scene_file import file_in, load_json, poses_in
 
@@ -141,8 +140,9 @@ class ReadsNear(DataParser):
     def _points(self, path: Path) -> Array:
         """Shifted sparse points [P, 3] of a .ply, or of the folder of a COLMAP model."""
         if not path.is_dir():
-            assert self.shift is not None
-            return read_cloud(path).positions - self.shift
+            import open3d  # as nerfstudio reads it, all points in the same order
+
+            return np.asarray(open3d.io.read_point_cloud(path).points) - self.shift
         read, name = colmap_parsing_utils.read_points3D_binary, "points3D.bin"
         if not (path / name).exists():
             read, name = colmap_parsing_utils.read_points3D_text, "points3D.txt"
