@@ -9,12 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from leco_plugin.chart.summary import Line, compare, figure_in, middle_of
+from leco_plugin.chart.summary import KEPT, Line, compare, figure_in, middle_of
 
 OURS = "(ours)"
 """Marks the contender that a suite asks about."""
-KEPT_WHEN_FROZEN = "at_equal_loss.kept_reached_volume"
-"""Share of the volume reached by rays that a gate keeps at equal loss."""
 AT_THE_END = 0.99
 """Share of the training time; a gate that is frozen later has guided nothing."""
 
@@ -60,8 +58,8 @@ class Learned(Line):
     @cached_property
     def kept_by_seed(self) -> dict[int, float]:
         """Percent of the space, of each seed of which it was measured."""
-        found = {facts["seed"]: figure_in(facts, KEPT_WHEN_FROZEN) for facts in self.facts}
-        return {seed: 100.0 * share for seed, share in found.items() if share is not None}
+        found = {run["seed"]: KEPT.of(run) for run in self.runs}
+        return {seed: share for seed, share in found.items() if share is not None}
 
     @property
     def is_measured(self) -> bool:

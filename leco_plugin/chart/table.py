@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, TypeVar
 
+from leco_plugin.chart import summary
 from leco_plugin.chart.learned import Learned, falls, learned_of, settling
 from leco_plugin.chart.panels import cost_panel, finding_of
 from leco_plugin.chart.representations import (
@@ -16,26 +17,14 @@ from leco_plugin.chart.representations import (
     never_held_of,
     representations_of,
 )
-from leco_plugin.chart.summary import (
-    COSTS,
-    LEARNING,
-    Cost,
-    Line,
-    Versus,
-    at_equal_loss,
-    circumstances,
-    common_psnr,
-    lines_of,
-    rivals,
-    sentence,
-)
+from leco_plugin.chart.summary import Cost, Line, Versus
 
 T = TypeVar("T")
 
 SPENT = {
     "steps": Cost("steps", "steps", ""),
     "trained, s": Cost("train_seconds", "trained", "s"),
-    "of which learning, s": LEARNING,
+    "of which learning, s": summary.LEARNING,
     "ms a step": Cost("step_seconds", "a step", "ms", 1e3),
 }
 QUALITIES = {
@@ -115,24 +104,25 @@ def table(results: Mapping[str, Any]) -> str:
         f"# {results['scene']['name']}" + (f": {results['suite']}" if results["suite"] else ""),
         *([results["question"]] if results["question"] else []),
     ]
-    lines = lines_of(results) if results["runs"] else []
+    lines = summary.lines_of(results) if results["runs"] else []
     if missing := results.get("missing", 0):
         made = len(results["runs"])
         parts.append(f"**{made} of {made + missing} runs so far**: what is said here may change.")
     if lines:
-        parts += [f"{finding_of(results)}. {circumstances(results)}.", runs_table(lines)]
+        parts += [f"{finding_of(results)}. {summary.circumstances(results)}.", runs_table(lines)]
     if warming := [line.name for line in lines if line.warming_up]:
         parts.append(
             f"Ended in the warm-up of their grid, which asks all cells: {' and '.join(warming)}."
         )
-    if duels := rivals(lines, results["protocol"]["seconds"]):
+    if duels := summary.rivals(lines, results["protocol"]["seconds"]):
         parts.append(versus_table(duels))
     if len(lines) > 1 and results["protocol"]["seconds"] is not None:
         parts.append(settling(lines))
     if fallen := falls(lines):
-        parts.append(f"{sentence(fallen)}.")
-    if results["failures"]:
-        parts.append(failures_table(results["failures"]))
+        parts.append(f"{summary.sentence(fallen)}.")
+    if failures := results["failures"]:
+        cells = [[one["name"], str(one["seed"]), f"failed: {one['reason']}"] for one in failures]
+        parts.append(rows(["method", "seed", "reason"], cells))
     if learned := learned_of(lines):
         parts.append(occupancy_table(learned))
     if held := representations_of(lines):
@@ -146,7 +136,7 @@ def table(results: Mapping[str, Any]) -> str:
 def runs_table(lines: Sequence[Line]) -> str:
     """Means of quality and medians of cost over seeds, bold on the front of its column; and a line
     on figures of quality that no run has."""
-    level = common_psnr(lines)
+    level = summary.common_psnr(lines)
     runs = [run for line in lines for run in line.runs]
     measured, missing = {}, []
     for title, (key, form) in QUALITIES.items():
@@ -154,7 +144,7 @@ def runs_table(lines: Sequence[Line]) -> str:
             measured[title] = lambda line, key=key, form=form: spread([line.mean(key)], form)
         else:
             missing.append(title)
-    fronts = {cost: cost_panel(cost, lines).front() for cost in COSTS}
+    fronts = {cost: cost_panel(cost, lines).front() for cost in summary.COSTS}
 
     def with_front(cost: Cost, line: Line) -> str:
         is_on_front = (line.median(cost), line.psnr) in fronts[cost]
@@ -169,7 +159,7 @@ def runs_table(lines: Sequence[Line]) -> str:
             **measured,
             f"s to {level:.1f} dB": partial(_seconds_to, level),
             **{title: partial(_median, cost) for title, cost in SPENT.items()},
-            **{cost.titled: partial(with_front, cost) for cost in COSTS},
+            **{cost.titled: partial(with_front, cost) for cost in summary.COSTS},
         },
     )
     return f"{found}\n\nNot measured: {', '.join(missing)}." if missing else found
@@ -239,11 +229,6 @@ def queries_table(lines: Sequence[Line]) -> str:
     return table_of(lines, {"positions asked of": lambda line: line.name, **figures})
 
 
-def failures_table(failures: Sequence[Mapping[str, Any]]) -> str:
-    cells = [[one["name"], str(one["seed"]), f"failed: {one['reason']}"] for one in failures]
-    return rows(["method", "seed", "reason"], cells)
-
-
 def occupancy_table(learned: Sequence[Learned]) -> str:
     """Occupancies: medians over the seeds in which a gate was frozen. Size and true surface kept
     are of the gate at the end, which may be smaller than the one that was frozen."""
@@ -286,7 +271,7 @@ def left_out(lines: Sequence[Line]) -> list[str]:
     said = []
     if names := never_held_of(lines):
         said.append(f"Left out, for not frozen with every seed: {', '.join(names)}.")
-    measured = at_equal_loss(lines)
+    measured = summary.at_equal_loss(lines)
     sizes = {size for one in measured for size in one.get("left_out", ())}
     others = [row for one in measured for row in one.get("others", ())]
     if full := {row["name"] for row in others if keeps_all(row)}:
