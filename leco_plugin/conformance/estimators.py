@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from leco_plugin.conformance import scene as kit
 from leco_plugin.conformance.rules import checks, raises_nothing, require
 from leco_plugin.conformance.samplers import (
     SamplerCase,
@@ -20,37 +21,7 @@ from leco_plugin.conformance.samplers import (
     check_tensor,
     devices,
 )
-from leco_plugin.conformance.scene import (
-    AROUND,
-    BACKGROUND,
-    EVERYTHING,
-    LONG_STEP,
-    MANY,
-    MARGIN,
-    NOTHING,
-    PARTS,
-    SHORT_STEP,
-    SLAB,
-    STEP,
-    TWO,
-    Field,
-    Rays,
-    Slab,
-    among,
-    box,
-    check_intervals,
-    covered,
-    crossing,
-    cut_short,
-    dense,
-    in_order,
-    leaving,
-    render,
-    same,
-    stretched,
-    within,
-    without_samples,
-)
+from leco_plugin.conformance.scene import SLAB, Field, Rays, Slab
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.marching import Samples
@@ -64,7 +35,7 @@ class EstimatorCase(SamplerCase):
     seam = "estimator"
 
     def build(self, occupancy: Occupancy | None) -> Any:
-        return build_estimator(self.name, aabb=box(), occupancy=occupancy, **self.options)
+        return build_estimator(self.name, aabb=kit.box(), occupancy=occupancy, **self.options)
 
     def teach(self, sampler: Any, scene: Slab) -> None:
         sampler.train()
@@ -85,7 +56,7 @@ class EstimatorCase(SamplerCase):
             **{
                 "t_min": rays.t_min,
                 "t_max": rays.t_max,
-                "render_step_size": STEP,
+                "render_step_size": kit.STEP,
                 "stratified": sampler.training,
                 **options,
             },
@@ -102,7 +73,7 @@ class EstimatorCase(SamplerCase):
         def sigma_fn(t_starts: Tensor, t_ends: Tensor, ray_indices: Tensor) -> Tensor:
             return field.density(rays.at(ray_indices, (t_starts + t_ends) / 2.0))
 
-        return render(field, rays, self.sample(sampler, rays, sigma_fn=sigma_fn))
+        return kit.render(field, rays, self.sample(sampler, rays, sigma_fn=sigma_fn))
 
 
 NEAR, FAR = 2.5, 3.4
@@ -111,7 +82,6 @@ NEAR, FAR = 2.5, 3.4
 
 @checks("signature", "estimator")
 def signature(case: EstimatorCase) -> None:
-    """The two verbs take nerfacc's arguments in nerfacc's order with nerfacc's defaults."""
     sampler = case.shared(SLAB)
     check_module(sampler, "sampling", "update_every_n_steps")
     offered = list(inspect.signature(sampler.sampling).parameters.values())
@@ -129,9 +99,8 @@ def signature(case: EstimatorCase) -> None:
 
 @checks("shapes-types-devices", "estimator")
 def shapes_types_devices(case: EstimatorCase) -> None:
-    """Three flat tensors of one length, of the type and on the device of the rays."""
     for device in devices():
-        sampler, rays = case.shared(SLAB).to(device), crossing().to(device)
+        sampler, rays = case.shared(SLAB).to(device), kit.crossing().to(device)
         for training in (False, True):
             given = rays.copied()
             samples = case.ask(sampler.train(training), given)
@@ -142,30 +111,33 @@ def shapes_types_devices(case: EstimatorCase) -> None:
                 f"ray_indices, t_starts and t_ends have shapes {shapes}; expected [n_samples] each",
             )
             where = samples[0].device
-            require(where == rays.origins.device, f"{PARTS[0]} is on {where}")
-            for name, part in zip(PARTS[1:], samples[1:], strict=True):
+            require(where == rays.origins.device, f"{kit.PARTS[0]} is on {where}")
+            for name, part in zip(kit.PARTS[1:], samples[1:], strict=True):
                 check_tensor(name, part, rays.origins)
         sampler.to("cpu")
 
 
 @checks("sorted-disjoint-inside", "estimator")
 def sorted_disjoint_inside(case: EstimatorCase) -> None:
-    """Along each ray, samples follow one another between its ends."""
-    sampler, rays = case.shared(SLAB), cut_short()
+    sampler, rays = case.shared(SLAB), kit.cut_short()
     for cone_angle in (0.0, 0.02):
-        check_intervals(rays, case.sample(sampler, rays, cone_angle=cone_angle))
-    many = cut_short(MANY)
+        kit.check_intervals(rays, case.sample(sampler, rays, cone_angle=cone_angle))
+    many = kit.cut_short(kit.MANY)
     narrower = many._replace(t_min=many.t_min.clamp(min=NEAR), t_max=many.t_max.clamp(max=FAR))
-    planes: dict[str, Any] = {"near_plane": NEAR, "far_plane": FAR, "render_step_size": LONG_STEP}
+    planes: dict[str, Any] = {
+        "near_plane": NEAR,
+        "far_plane": FAR,
+        "render_step_size": kit.LONG_STEP,
+    }
     for training in (False, True):
-        check_intervals(narrower, case.sample(sampler.train(training), many, **planes))
+        kit.check_intervals(narrower, case.sample(sampler.train(training), many, **planes))
     for near, far in ((NEAR, FAR), (0.05, 1e3)):  # the second are Instant-NGP's
         _check_between_planes(case, sampler, near, far)
 
 
 def _check_between_planes(case: EstimatorCase, sampler: Any, near: float, far: float) -> None:
     """Raises unless rays without limits of their own are sampled from near plane to far plane."""
-    rays = crossing()
+    rays = kit.crossing()
     planes: dict[str, Any] = {"near_plane": near, "far_plane": far, "t_min": None, "t_max": None}
     ends = {"t_min": torch.full_like(rays.t_min, near), "t_max": torch.full_like(rays.t_max, far)}
     between = rays._replace(**ends)
@@ -173,9 +145,9 @@ def _check_between_planes(case: EstimatorCase, sampler: Any, near: float, far: f
         sampler.train(training)
         with raises_nothing("sampling without t_min and t_max raises"):
             found = case.sample(sampler, rays, **planes)
-        check_intervals(between, found)
+        kit.check_intervals(between, found)
     expected = case.sample(sampler, between)
-    apart = int((~among(expected, found)).sum() + (~among(found, expected)).sum())
+    apart = int((~kit.among(expected, found)).sum() + (~kit.among(found, expected)).sum())
     require(
         apart <= ALLOWED_DIFFERENCE * len(expected[0]),
         f"with near_plane {near:g} and far_plane {far:g} in place of t_min and t_max, {apart} of "
@@ -185,9 +157,8 @@ def _check_between_planes(case: EstimatorCase, sampler: Any, near: float, far: f
 
 @checks("packing-consistent", "estimator")
 def packing_consistent(case: EstimatorCase) -> None:
-    """Rays come in order, by indices that `pack_info` can turn into starts and counts."""
-    rays = crossing(MANY)
-    ray_indices = case.sample(case.shared(SLAB), rays, render_step_size=LONG_STEP)[0]
+    rays = kit.crossing(kit.MANY)
+    ray_indices = case.sample(case.shared(SLAB), rays, render_step_size=kit.LONG_STEP)[0]
     n_rays = len(rays.origins)
     require(ray_indices.dtype == torch.int64, f"ray_indices is {ray_indices.dtype}, not int64")
     low, high = (int(bound) for bound in ray_indices.aminmax())
@@ -204,11 +175,12 @@ def packing_consistent(case: EstimatorCase) -> None:
 
 @checks("stratified-in-training", "estimator")
 def stratified_in_training(case: EstimatorCase) -> None:
-    """Samples shift by a share of a step in training, uniform over the rays and of each alone."""
     check_shifts(case)
-    sampler, rays = case.shared(EVERYTHING).train(), crossing(MANY)
-    ray_indices, t_starts, _ = in_order(case.sample(sampler, rays, render_step_size=LONG_STEP))
-    shares = ((t_starts - rays.t_min[ray_indices]) / LONG_STEP).remainder(1.0)
+    sampler, rays = case.shared(kit.EVERYTHING).train(), kit.crossing(kit.MANY)
+    ray_indices, t_starts, _ = kit.in_order(
+        case.sample(sampler, rays, render_step_size=kit.LONG_STEP)
+    )
+    shares = ((t_starts - rays.t_min[ray_indices]) / kit.LONG_STEP).remainder(1.0)
     first = torch.searchsorted(ray_indices, ray_indices.unique())
     _check_uniform(shares[first])
 
@@ -238,11 +210,10 @@ def _check_uniform(shares: Tensor) -> None:
 
 @checks("zero-samples-well-formed", "estimator")
 def zero_samples_well_formed(case: EstimatorCase) -> None:
-    """Where there is nothing to sample, nothing is returned, and it renders as background."""
     sampler = case.shared(SLAB)
     asked: list[dict[str, Any]] = [{}, {"sigma_fn": lambda t_starts, *_: torch.ones_like(t_starts)}]
     for training in (False, True):
-        for why, rays in without_samples().items():
+        for why, rays in kit.without_samples().items():
             field = Field()
             sampler.train(training)
             for options in asked:
@@ -250,8 +221,8 @@ def zero_samples_well_formed(case: EstimatorCase) -> None:
                 found = [(list(part.shape), part.dtype) for part in samples]
                 wanted = [([0], dtype) for dtype in (torch.int64, *[rays.origins.dtype] * 2)]
                 require(found == wanted, f"{why}: returned {found}, expected {wanted}")
-                colours = render(field, rays, samples)
-                background = colours.new_tensor(BACKGROUND).expand_as(colours)
+                colours = kit.render(field, rays, samples)
+                background = colours.new_tensor(kit.BACKGROUND).expand_as(colours)
                 shown = torch.allclose(colours, background)
                 require(shown, f"{why}: the background is not what is rendered")
                 colours.sum().backward()
@@ -266,13 +237,12 @@ CONE_ANGLE = 0.02
 
 @checks("skips-only-what-it-may", "estimator")
 def skips_only_what_it_may(case: EstimatorCase) -> None:
-    """What is plainly kept is sampled; what is plainly skipped is not, where the gate decides."""
     for training in (False, True):
         for scene, step, rays in (
-            (SLAB, STEP, crossing()),
-            (SLAB, STEP, stretched()),
-            (SLAB, STEP, within()),
-            (TWO, LONG_STEP, crossing(MANY)),
+            (SLAB, kit.STEP, kit.crossing()),
+            (SLAB, kit.STEP, kit.stretched()),
+            (SLAB, kit.STEP, kit.within()),
+            (kit.TWO, kit.LONG_STEP, kit.crossing(kit.MANY)),
         ):
             sampler = case.shared(scene).train(training)
             samples = case.sample(sampler, rays, render_step_size=step)
@@ -280,27 +250,27 @@ def skips_only_what_it_may(case: EstimatorCase) -> None:
                 _check_skipped_is_not(rays, samples, scene)
             _check_kept_is_sampled(rays, samples, scene, step, training)
     if case.needs_occupancy:  # the host's box is not where an unbounded scene ends
-        samples = case.sample(case.shared(AROUND), leaving())
-        _check_skipped_is_not(leaving(), samples, AROUND)
-        _check_kept_is_sampled(leaving(), samples, AROUND)
+        samples = case.sample(case.shared(kit.AROUND), kit.leaving())
+        _check_skipped_is_not(kit.leaving(), samples, kit.AROUND)
+        _check_kept_is_sampled(kit.leaving(), samples, kit.AROUND)
 
 
 def _check_skipped_is_not(rays: Rays, samples: Samples, scene: Slab) -> None:
     positions = rays.at(samples[0], (samples[1] + samples[2]) / 2.0)
-    outside = scene.depth(positions) < -MARGIN
+    outside = scene.depth(positions) < -kit.MARGIN
     said = f"{int(outside.sum())} of {len(outside)} samples lie where the occupancy is empty"
     require(not bool(outside.any()), said + _first(positions[outside]))
 
 
 def _check_kept_is_sampled(
-    rays: Rays, samples: Samples, scene: Slab = SLAB, step: float = STEP, shifted: bool = False
+    rays: Rays, samples: Samples, scene: Slab = SLAB, step: float = kit.STEP, shifted: bool = False
 ) -> None:
     """Raises unless every candidate that lies plainly in a slab is in a sample's interval.
 
     The middles of shifted samples are half a step away, and the ends of a ray may have none.
     """
     ray_indices, middles = _plainly_kept(rays, scene, step, shifted)
-    missing = ~covered(ray_indices, middles, samples)
+    missing = ~kit.covered(ray_indices, middles, samples)
     places = f"{int(missing.sum())} of {len(missing)} places"
     said = f"{places} are not sampled although they are occupied"
     require(not bool(missing.any()), said + _first(rays.at(ray_indices, middles)[missing]))
@@ -309,10 +279,10 @@ def _check_kept_is_sampled(
 @functools.lru_cache(maxsize=32)
 def _plainly_kept(rays: Rays, scene: Slab, step: float, shifted: bool) -> tuple[Tensor, Tensor]:
     """Rays and middles of the candidates that `_check_kept_is_sampled` seeks, [N] each."""
-    ray_indices, t_starts, t_ends = dense(rays, step=step, unbounded=scene.unbounded)
+    ray_indices, t_starts, t_ends = kit.dense(rays, step=step, unbounded=scene.unbounded)
     middles = (t_starts + t_ends) / 2.0
     from_ends = torch.minimum(middles - rays.t_min[ray_indices], rays.t_max[ray_indices] - middles)
-    sought = scene.depth(rays.at(ray_indices, middles)) > MARGIN + shifted * step / 2.0
+    sought = scene.depth(rays.at(ray_indices, middles)) > kit.MARGIN + shifted * step / 2.0
     sought &= from_ends > shifted * step
     return ray_indices[sought], middles[sought]
 
@@ -324,22 +294,21 @@ def _first(positions: Tensor) -> str:
 
 @checks("all-kept-equals-dense", "estimator")
 def all_kept_equals_dense(case: EstimatorCase) -> None:
-    """Where everything is occupied, samples are those of the ray-marching rule without skipping."""
-    rays, few, sampler = crossing(), crossing(4), case.shared(EVERYTHING)
+    rays, few, sampler = kit.crossing(), kit.crossing(4), case.shared(kit.EVERYTHING)
     for training, cone_angle in itertools.product((False, True), (0.0, CONE_ANGLE)):
         options: dict[str, Any] = {"cone_angle": cone_angle, "stratified": False}
         samples = case.sample(sampler.train(training), rays, **options)
-        expected = dense(rays, cone_angle)
-        missing = int((~among(expected, samples)).sum())
-        extra = int((~among(samples, expected)).sum())
+        expected = kit.dense(rays, cone_angle)
+        missing = int((~kit.among(expected, samples)).sum())
+        extra = int((~kit.among(samples, expected)).sum())
         require(
             missing + extra <= ALLOWED_DIFFERENCE * len(expected[0]),
             f"with cone_angle {cone_angle:g}{', in training without stratified,' * training} "
             f"{missing} of {len(expected[0])} candidates are missing, {extra} samples are none of "
             "them",
         )
-    found = len(case.sample(sampler.eval(), few, render_step_size=SHORT_STEP)[0])
-    count = len(dense(few, step=SHORT_STEP)[0])
+    found = len(case.sample(sampler.eval(), few, render_step_size=kit.SHORT_STEP)[0])
+    count = len(kit.dense(few, step=kit.SHORT_STEP)[0])
     require(
         abs(found - count) <= ALLOWED_DIFFERENCE * count,
         f"of {count} candidates on {len(few.origins)} rays {found} are sampled",
@@ -348,11 +317,10 @@ def all_kept_equals_dense(case: EstimatorCase) -> None:
 
 @checks("update-while-frozen-is-harmless", "estimator")
 def update_while_frozen_is_harmless(case: EstimatorCase) -> None:
-    """Hosts go on updating what they take for a grid: every form of the call is accepted."""
-    sampler, rays = case.shared(SLAB), crossing()
+    sampler, rays = case.shared(SLAB), kit.crossing()
     before = case.sample(sampler, rays)
     sampler.train()
-    answer = NOTHING.density if case.needs_occupancy else SLAB.density
+    answer = kit.NOTHING.density if case.needs_occupancy else SLAB.density
     thresholds = {"occ_thre": 1e-2, "ema_decay": 0.95, "warmup_steps": 256, "n": 16}
     # as nerfstudio and nerfacc's examples call it; steps in and after nerfacc's warm-up
     named = {"occ_eval_fn": answer}
@@ -367,6 +335,6 @@ def update_while_frozen_is_harmless(case: EstimatorCase) -> None:
             sampler.update_every_n_steps(*arguments, **options)
     after = case.sample(sampler.eval(), rays)
     if case.needs_occupancy:
-        require(same(before, after), "updates with an empty field changed what is sampled")
+        require(kit.same(before, after), "updates with an empty field changed what is sampled")
     else:
         _check_kept_is_sampled(rays, after)

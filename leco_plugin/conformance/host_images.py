@@ -10,29 +10,13 @@ from unittest.mock import patch
 import torch
 from torch import Tensor, nn
 
-from leco_plugin.conformance.hosts import (
-    HostCase,
-    batch,
-    bundle,
-    cameras,
-    inside_the_box,
-    loss_of,
-    turned_away,
-)
+from leco_plugin.conformance import hosts
+from leco_plugin.conformance import scene as kit
+from leco_plugin.conformance.hosts import HostCase
 from leco_plugin.conformance.proposals import CHORD, INSIDE, NEARBY, chords
 from leco_plugin.conformance.rules import checks, raises_nothing, require
 from leco_plugin.conformance.samplers import check_tensor, devices, of_two_seeds
-from leco_plugin.conformance.scene import (
-    AROUND,
-    DISTANCE,
-    EVERYTHING,
-    MARGIN,
-    NOTHING,
-    ROUNDING,
-    SLAB,
-    Rays,
-    box,
-)
+from leco_plugin.conformance.scene import SLAB, Rays
 from leco_plugin.hosts.stand_ins import GuidedEstimator, GuidedProposal, is_packed
 from leco_plugin.samplers.base import DenseEstimator, Estimator
 from leco_plugin.samplers.marching import Samples
@@ -69,7 +53,7 @@ def asked_and_sampled(model: Model) -> tuple[Tensor, Tensor]:
                 stack.enter_context(module.register_forward_pre_hook(before, with_kwargs=True))
             elif isinstance(module, GuidedEstimator | GuidedProposal):
                 stack.enter_context(_noting(module, sampled))
-        model(bundle())
+        model(hosts.bundle())
     require(bool(asked or sampled), "the field is asked about no sample at all")
     require(bool(sampled), "the sampler is not asked")
     return torch.cat(asked or sampled), torch.cat(sampled)
@@ -105,7 +89,7 @@ def sample_densely(model: Model) -> Iterator[None]:
     with ExitStack() as stack:
         for module in model.modules():
             if isinstance(module, GuidedEstimator | AbstractEstimator | Estimator):
-                everywhere = DenseEstimator(box()).sampling
+                everywhere = DenseEstimator(kit.box()).sampling
                 stack.enter_context(patch.object(module, "sampling", everywhere))
             elif isinstance(module, GuidedProposal):
                 stack.enter_context(patch.object(module, "forward", _all_of_each_ray))
@@ -137,13 +121,12 @@ OPAQUE = 1e-4
 
 @checks("outputs-can-be-drawn", "host")
 def outputs_can_be_drawn(case: HostCase) -> None:
-    """Colour, depth and accumulation have their channels; every output can be made a picture."""
     for device in devices():
         model = case.shared().to(device)
-        rays = bundle().to(device)
+        rays = hosts.bundle().to(device)
         with torch.no_grad():
             flat = model(rays)
-            images = model.get_outputs_for_camera(cameras()[:1].to(device))
+            images = model.get_outputs_for_camera(hosts.cameras()[:1].to(device))
         for name, channels in CHANNELS.items():
             _check_output(name, flat.get(name), (len(rays), channels), rays.origins)
         for name, image in images.items():
@@ -170,9 +153,8 @@ def _check_picture(name: str, image: Tensor) -> None:
 
 @checks("same-image-in-eval", "host")
 def same_image_in_eval(case: HostCase) -> None:
-    """Evaluation does not depend on random numbers."""
     model = case.shared()
-    one, other = of_two_seeds(lambda seed: rendered(model, bundle(), seed))
+    one, other = of_two_seeds(lambda seed: rendered(model, hosts.bundle(), seed))
     for name, value in one.items():
         require(value.equal(other[name]), f"two evaluations of the same rays differ in {name!r}")
 
@@ -187,10 +169,9 @@ def rendered(model: Model, rays: RayBundle, seed: int = 0) -> dict[str, Tensor]:
 
 @checks("empty-rays-show-background", "host")
 def empty_rays_show_background(case: HostCase) -> None:
-    """Nothing to sample, in a whole batch or a part of it, is no failure and no light."""
     for why, model, rays in (
-        ("rays that miss the scene", case.shared(SLAB), turned_away),
-        ("an occupancy that keeps nothing", case.shared(NOTHING), bundle),
+        ("rays that miss the scene", case.shared(SLAB), hosts.turned_away),
+        ("an occupancy that keeps nothing", case.shared(kit.NOTHING), hosts.bundle),
     ):
         outputs = rendered(model, rays())
         for name in CHANNELS:
@@ -198,7 +179,7 @@ def empty_rays_show_background(case: HostCase) -> None:
             require(finite, f"{why}: the output {name!r} holds values that are not finite")
         if is_packed(model):
             _check_background(why, model, outputs)
-        loss = loss_of(model.train(), rays(), batch())
+        loss = hosts.loss_of(model.train(), rays(), hosts.batch())
         require(bool(loss.isfinite()), f"{why}: the loss is {loss.item()}")
         require(loss.requires_grad, f"{why}: the loss has no gradient, so that the step fails")
         loss.backward()  # type: ignore[no-untyped-call]
@@ -236,15 +217,14 @@ def _listed(colour: Tensor) -> list[float]:
 
 @checks("shades-only-what-is-kept", "host")
 def shades_only_what_is_kept(case: HostCase) -> None:
-    """The field is asked where the occupancy keeps something, on every ray, and nowhere else."""
-    rays, along = bundle(), torch.zeros(len(bundle()))
-    enters, leaves = chords(Rays(rays.origins, rays.directions, along, along + 2.0 * DISTANCE))
+    rays, along = hosts.bundle(), torch.zeros(len(hosts.bundle()))
+    enters, leaves = chords(Rays(rays.origins, rays.directions, along, along + 2.0 * kit.DISTANCE))
     require(bool((leaves - enters > CHORD).all()), "the kit's rays do not all cross its slab")
     for training, moved, scene in (
         (False, False, SLAB),
         (True, False, SLAB),
         (False, True, SLAB),
-        (False, False, AROUND),
+        (False, False, kit.AROUND),
     ):
         model = case.shared(scene, moved).train(training)
         positions, sampled = asked_and_sampled(model)
@@ -257,7 +237,7 @@ def shades_only_what_is_kept(case: HostCase) -> None:
             require(near >= INSIDE, f"{near:.0%} of all samples lie in or near what is occupied")
             continue
         if not scene.unbounded:  # where a ray ends in a backdrop, whatever is there
-            outside = int((depths < -MARGIN).sum())
+            outside = int((depths < -kit.MARGIN).sum())
             share = f"{outside} of {len(depths)} places"
             require(outside == 0, f"the field is asked about {share} where all is empty")
         if not training:
@@ -277,7 +257,7 @@ def _apart(positions: Tensor, others: Tensor) -> Tensor:
     from scipy.spatial import cKDTree
 
     distances, _ = cKDTree(others.double().numpy()).query(positions.double().numpy())
-    return torch.from_numpy(distances) > ROUNDING + RELATIVE * positions.norm(dim=-1)
+    return torch.from_numpy(distances) > kit.ROUNDING + RELATIVE * positions.norm(dim=-1)
 
 
 def _rays_through(positions: Tensor, origins: Tensor, directions: Tensor) -> Tensor:
@@ -289,11 +269,10 @@ def _rays_through(positions: Tensor, origins: Tensor, directions: Tensor) -> Ten
 
 @checks("guided-by-everything-is-dense", "host")
 def guided_by_everything_is_dense(case: HostCase) -> None:
-    """Where everything is occupied, an image is the one without guidance, but for the sampling."""
-    model = case.shared(EVERYTHING)
-    found = rendered(model, inside_the_box())
+    model = case.shared(kit.EVERYTHING)
+    found = rendered(model, hosts.inside_the_box())
     with sample_densely(model):
-        expected = rendered(model, inside_the_box())
+        expected = rendered(model, hosts.inside_the_box())
     tolerance = TOLERANCE[is_packed(model)]
     for name in CHANNELS:
         largest = float(expected[name].abs().max().clamp(min=1e-6))

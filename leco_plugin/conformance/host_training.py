@@ -16,17 +16,9 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from leco_plugin.conformance import hosts
 from leco_plugin.conformance.host_images import asked_and_sampled, rendered, sample_densely
-from leco_plugin.conformance.hosts import (
-    HostCase,
-    batch,
-    build,
-    bundle,
-    callbacks,
-    cameras,
-    loss_of,
-    quietly,
-)
+from leco_plugin.conformance.hosts import HostCase
 from leco_plugin.conformance.rules import checks, require
 from leco_plugin.conformance.samplers import on_two_ranks, reloaded
 from leco_plugin.conformance.scene import CENTRE, HALF, SLAB
@@ -43,7 +35,6 @@ GUIDE = "leco_guide."
 
 @checks("samples-shift-in-training", "host")
 def samples_shift_in_training(case: HostCase) -> None:
-    """The field is asked at other places in each step."""
     model = case.shared().train()
     places = []
     for seed in (1, 2):
@@ -55,7 +46,6 @@ def samples_shift_in_training(case: HostCase) -> None:
 
 @checks("teaches-the-host-alone", "host")
 def teaches_the_host_alone(case: HostCase) -> None:
-    """A step moves the host's parameters, and never the frozen gate."""
     model: Any = case.shared()
     groups = model.get_param_groups()
     handed_out = {id(parameter) for group in groups.values() for parameter in group}
@@ -77,7 +67,7 @@ def teaches_the_host_alone(case: HostCase) -> None:
 def gradients_of_a_step(model: Model) -> dict[str, Tensor]:
     """Gradients of the batch's loss by parameter, for parameters that it reaches."""
     torch.manual_seed(0)
-    loss = loss_of(model.train(), bundle(), batch())
+    loss = hosts.loss_of(model.train(), hosts.bundle(), hosts.batch())
     require(loss.requires_grad, "the loss has no gradient")
     loss.backward()  # type: ignore[no-untyped-call]
     gradients = _gradients(model)
@@ -87,7 +77,6 @@ def gradients_of_a_step(model: Model) -> dict[str, Tensor]:
 
 @checks("nothing-superfluous-is-left", "host")
 def nothing_superfluous_is_left(case: HostCase) -> None:
-    """What the gate stands for is gone from memory, checkpoints and optimizers."""
     from leco_plugin.hosts.seams import PACKED, PROPOSAL
 
     own, model = case.unguided(), case.shared()
@@ -123,17 +112,17 @@ def state_and_yaml_round_trip(case: HostCase) -> None:
     import yaml  # type: ignore[import-untyped]
 
     model = case.shared()
-    expected = rendered(model, bundle())
+    expected = rendered(model, hosts.bundle())
     with TemporaryDirectory() as folder:
         config = copy.deepcopy(case.config)
         config.pipeline.model.occupancy.path = Path(folder) / case.file.name  # type: ignore[attr-defined]
         case.occupancy(SLAB).save(config.pipeline.model.occupancy.path)  # type: ignore[attr-defined]
         written = yaml.dump(config)
     read: Any = yaml.load(written, Loader=yaml.Loader)
-    restored = build(read.pipeline.model, seed=1)
+    restored = hosts.build(read.pipeline.model, seed=1)
     restored.update_to_step(1)
     restored.load_state_dict(reloaded(model.state_dict()), strict=True)
-    for name, value in rendered(restored, bundle()).items():
+    for name, value in rendered(restored, hosts.bundle()).items():
         said = f"the output {name!r} of a model that was restored is not that of the one it is of"
         require(value.equal(expected[name]), said)
 
@@ -142,7 +131,7 @@ class Run:
     """A training run as nerfstudio's trainer makes it, of the same batch in every step."""
 
     def __init__(self, config: TrainerConfig, seed: int) -> None:
-        self.model = build(config.pipeline.model, seed)
+        self.model = hosts.build(config.pipeline.model, seed)
         self.begin(config, self.model)
 
     def begin(self, config: TrainerConfig, owner: Any) -> None:
@@ -150,7 +139,7 @@ class Run:
         from nerfstudio.engine.optimizers import Optimizers
 
         self.optimizers = Optimizers(copy.deepcopy(config.optimizers), owner.get_param_groups())
-        self.callbacks = callbacks(owner, self.optimizers)
+        self.callbacks = hosts.callbacks(owner, self.optimizers)
 
     def step(self, step: int) -> float:
         """Takes a step, with random numbers of its own; returns the loss."""
@@ -170,7 +159,7 @@ class Run:
 
     def loss(self, step: int) -> Tensor:
         """The loss of a step."""
-        return loss_of(self.model, bundle(), batch())
+        return hosts.loss_of(self.model, hosts.bundle(), hosts.batch())
 
     def _call(self, step: int, location: TrainingCallbackLocation) -> None:
         for callback in self.callbacks:
@@ -199,7 +188,6 @@ class Run:
 
 @checks("resumes-where-it-stopped", "host")
 def resumes_where_it_stopped(case: HostCase) -> None:
-    """The step after a checkpoint is the same, whether or not the run was interrupted."""
     run, resumed = Run(case.config, seed=0), Run(case.config, seed=1)
     run.step(0)
     state, before = reloaded(run.state()), run.parameters()
@@ -223,8 +211,8 @@ def resumes_where_it_stopped(case: HostCase) -> None:
 def two_processes_step_alike(case: HostCase) -> None:
     """Two ranks with half a batch each get the gradients of one process with all of it."""
     config = case.config.pipeline.model  # type: ignore[attr-defined]
-    model = build(config)
-    callbacks(model)
+    model = hosts.build(config)
+    hosts.callbacks(model)
     for rank in range(2):
         _half_a_batch(model, rank).backward()  # type: ignore[no-untyped-call]
     alone = {name: gradient / 2.0 for name, gradient in _gradients(model).items()}
@@ -245,8 +233,8 @@ def gradients_of_rank(config: Any, rank: int) -> dict[str, Tensor]:
     """Gradients that a rank of data-parallel training gets from its half of the batch."""
     from torch.nn.parallel import DistributedDataParallel
 
-    model = build(config, seed=rank)
-    callbacks(model)
+    model = hosts.build(config, seed=rank)
+    hosts.callbacks(model)
     parallel = DistributedDataParallel(model, find_unused_parameters=True)
     _half_a_batch(model, rank, parallel).backward()  # type: ignore[no-untyped-call]
     return _gradients(model)
@@ -254,10 +242,10 @@ def gradients_of_rank(config: Any, rank: int) -> dict[str, Tensor]:
 
 def _half_a_batch(model: Any, rank: int, forward: Any = None) -> Tensor:
     """The loss of every second ray, in training, with the rank's own random numbers."""
-    rendered(model, bundle()[rank::2])  # whatever is built at first use is built
+    rendered(model, hosts.bundle()[rank::2])  # whatever is built at first use is built
     torch.manual_seed(rank)
-    half = {name: values[rank::2] for name, values in batch().items()}
-    return loss_of(model.train(), bundle()[rank::2], half, forward)
+    half = {name: values[rank::2] for name, values in hosts.batch().items()}
+    return hosts.loss_of(model.train(), hosts.bundle()[rank::2], half, forward)
 
 
 def _gradients(model: Any) -> dict[str, Tensor]:
@@ -274,7 +262,7 @@ class RunOnImages(Run):
 
     def __init__(self, config: Any) -> None:
         self._seed(0)
-        with quietly():
+        with hosts.quietly():
             self.pipeline = config.pipeline.setup(device="cpu", test_mode="val")
             self.pipeline.train()
             self.model = self.pipeline.model
@@ -290,7 +278,7 @@ class RunOnImages(Run):
     def learned(self) -> dict[str, Tensor]:
         """Parameters after a few steps."""
         self._seed(0)
-        with quietly():
+        with hosts.quietly():
             for step in range(STEPS):
                 self.step(step)
         return self.parameters()
@@ -345,7 +333,7 @@ def reading(config: Any, folder: Path) -> Any:
 
 def write_images(folder: Path) -> None:
     """Images of the scene of the kit, from its cameras and from farther off, with their poses."""
-    known = cameras()
+    known = hosts.cameras()
     corner, frames = torch.tensor([[0.0, 0.0, 0.0, 1.0]]), []
     for number in range(IMAGES):
         pose = known.camera_to_worlds[number % len(known)].clone()

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from leco_plugin.conformance import scene as kit
 from leco_plugin.conformance.rules import Broken, checks, require
 from leco_plugin.conformance.samplers import (
     SamplerCase,
@@ -18,26 +19,7 @@ from leco_plugin.conformance.samplers import (
     check_tensor,
     devices,
 )
-from leco_plugin.conformance.scene import (
-    AROUND,
-    BACKGROUND,
-    EVERYTHING,
-    FAR_AWAY,
-    MOVED,
-    ROUNDING,
-    SLAB,
-    Field,
-    Rays,
-    Slab,
-    check_intervals,
-    check_order,
-    crossing,
-    cut_short,
-    leaving,
-    same,
-    within,
-    without_samples,
-)
+from leco_plugin.conformance.scene import SLAB, Field, Rays, Slab
 from leco_plugin.log import counted
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.marching import Samples
@@ -94,7 +76,7 @@ class ProposalCase(SamplerCase):
         positions = ray_samples.frustums.get_positions()
         weights = ray_samples.get_weights(field.density(positions)[..., None])
         colours = (weights * field.colours(positions)).sum(dim=-2)
-        return colours + (1.0 - weights.sum(dim=-2)) * colours.new_tensor(BACKGROUND)
+        return colours + (1.0 - weights.sum(dim=-2)) * colours.new_tensor(kit.BACKGROUND)
 
 
 def no_density(*_: Any, **__: Any) -> None:
@@ -144,11 +126,10 @@ UNEVEN = 1.5
 
 @checks("signature", "proposal")
 def signature(case: ProposalCase) -> None:
-    """A module with the call and the two callbacks of nerfstudio's `ProposalNetworkSampler`."""
     sampler = case.shared(SLAB)
     check_module(sampler, "set_anneal", "step_cb")
     density = no_density if case.needs_occupancy else None
-    ray_samples, weights, candidates = case.answer(sampler, crossing(), density=density)
+    ray_samples, weights, candidates = case.answer(sampler, kit.crossing(), density=density)
     found = type(ray_samples).__name__
     require(hasattr(ray_samples, "frustums"), f"the first of three is {found}, not RaySamples")
     for name, found in (("weights_list", weights), ("ray_samples_list", candidates)):
@@ -157,9 +138,8 @@ def signature(case: ProposalCase) -> None:
 
 @checks("shapes-types-devices", "proposal")
 def shapes_types_devices(case: ProposalCase) -> None:
-    """As many samples on each ray; weights for the samples of each level that the host has."""
     for device in devices():
-        sampler, rays = case.shared(SLAB).to(device), crossing().to(device)
+        sampler, rays = case.shared(SLAB).to(device), kit.crossing().to(device)
         given = rays.copied()
         ray_samples, weights, candidates = case.ask(sampler, ray_bundle(given))
         check_rays(given, rays)
@@ -171,7 +151,9 @@ def shapes_types_devices(case: ProposalCase) -> None:
         require(isinstance(ray_samples.deltas, Tensor), "ray_samples have no deltas")
         _check_tensors("ray_samples", rays, starts, ends, ray_samples.deltas)
         apart = float((ray_samples.deltas - (ends - starts)).abs().max())
-        require(apart <= ROUNDING, f"deltas differ from the samples' lengths by up to {apart:.2g}")
+        require(
+            apart <= kit.ROUNDING, f"deltas differ from the samples' lengths by up to {apart:.2g}"
+        )
         _check_described(ray_samples, ray_bundle(rays))
         for level in range(LEVELS):
             starts, ends = _edges(candidates[level])
@@ -212,34 +194,32 @@ def _check_tensors(where: str, rays: Rays, *tensors: Tensor) -> None:
 
 @checks("sorted-disjoint-inside", "proposal")
 def sorted_disjoint_inside(case: ProposalCase) -> None:
-    """Along each ray, samples follow one another between its ends; so do the levels' samples."""
-    rays = cut_short()
+    rays = kit.cut_short()
     ray_samples, _, candidates = case.answer(case.shared(SLAB), rays)
     for samples in (packed(ray_samples), *map(packed, candidates)):
-        check_intervals(rays, samples)
-        beyond = samples[2] > rays.t_max[samples[0]] + ROUNDING
+        kit.check_intervals(rays, samples)
+        beyond = samples[2] > rays.t_max[samples[0]] + kit.ROUNDING
         require(
             not bool(beyond.any()),
             f"{counted(int(beyond.sum()), 'sample ends', 'samples end')} beyond a ray's far end",
         )
-    check_order(packed(case.answer(case.shared(SLAB).train(), rays)[0]))
+    kit.check_order(packed(case.answer(case.shared(SLAB).train(), rays)[0]))
 
 
 @checks("skips-only-what-it-may", "proposal")
 def skips_only_what_it_may(case: ProposalCase) -> None:
-    """Samples gather in what is kept, from where a ray enters it to where it leaves."""
     for training in (False, True):
         _check_gathered(case, case.shared(SLAB).train(training))
-    _check_gathered(case, case.shared(SLAB), within())
+    _check_gathered(case, case.shared(SLAB), kit.within())
     if case.needs_occupancy:
         _check_gathered(case, _in_other_coordinates(case).eval())
-        _check_gathered(case, case.shared(AROUND), leaving(), AROUND)
+        _check_gathered(case, case.shared(kit.AROUND), kit.leaving(), kit.AROUND)
 
 
 def _in_other_coordinates(case: ProposalCase) -> Any:
     """The sampler for a host whose coordinates are not those of the occupancy."""
     try:
-        return case.build(SLAB.occupancy(case.gate_encoding, MOVED), frame=MOVED)
+        return case.build(SLAB.occupancy(case.gate_encoding, kit.MOVED), frame=kit.MOVED)
     except TypeError as error:
         raise Broken(f"no host in other coordinates can have it (frame=): {error}") from error
 
@@ -247,7 +227,7 @@ def _in_other_coordinates(case: ProposalCase) -> Any:
 def _check_gathered(
     case: ProposalCase, sampler: Any, rays: Rays | None = None, scene: Slab = SLAB
 ) -> None:
-    rays = rays or crossing()
+    rays = rays or kit.crossing()
     enters, leaves = chords(rays, scene)
     long = leaves - enters >= CHORD
     ray_indices, t_starts, t_ends = case.sample(sampler, rays)
@@ -274,7 +254,7 @@ def _check_gathered(
 def chords(rays: Rays, scene: Slab = SLAB) -> tuple[Tensor, Tensor]:
     """Where each ray enters and leaves the slab, [n_rays] each, to a hundredth; 0 if never. One
     without end is left at `FAR_AWAY`."""
-    t = torch.arange(0.0, FAR_AWAY if scene.unbounded else 8.0, 0.01)
+    t = torch.arange(0.0, kit.FAR_AWAY if scene.unbounded else 8.0, 0.01)
     positions = rays.origins[:, None] + rays.directions[:, None] * t[:, None]
     inside = scene.depth(positions) >= 0.0
     first, last = inside.int().argmax(dim=1), len(t) - 1 - inside.flip(1).int().argmax(dim=1)
@@ -284,15 +264,13 @@ def chords(rays: Rays, scene: Slab = SLAB) -> tuple[Tensor, Tensor]:
 
 @checks("stratified-in-training", "proposal")
 def stratified_in_training(case: ProposalCase) -> None:
-    """Samples shift in training."""
     check_shifts(case)
 
 
 @checks("all-kept-equals-dense", "proposal")
 def all_kept_equals_dense(case: ProposalCase) -> None:
-    """Where everything is occupied, a ray is sampled from end to end; evenly, if a gate decides."""
-    rays = cut_short()  # which lie within the box: outside it nothing is occupied
-    ray_samples, _, _ = case.answer(case.shared(EVERYTHING), rays, EVERYTHING)
+    rays = kit.cut_short()  # which lie within the box: outside it nothing is occupied
+    ray_samples, _, _ = case.answer(case.shared(kit.EVERYTHING), rays, kit.EVERYTHING)
     starts, ends = ray_samples.spacing_starts, ray_samples.spacing_ends
     require(starts is not None and ends is not None, "ray_samples have no spacing_starts and ends")
     reaches = float(starts.amin(dim=1).max()), float(ends.amax(dim=1).min())
@@ -314,8 +292,7 @@ def all_kept_equals_dense(case: ProposalCase) -> None:
 
 @checks("zero-samples-well-formed", "proposal")
 def zero_samples_well_formed(case: ProposalCase) -> None:
-    """No rays, and rays on which everything is empty, still give what a host can render."""
-    sampler, without = case.shared(SLAB), without_samples()
+    sampler, without = case.shared(SLAB), kit.without_samples()
     for training in (False, True):
         sampler.train(training)
         for why in ("no rays", "rays that miss the box"):
@@ -326,15 +303,14 @@ def zero_samples_well_formed(case: ProposalCase) -> None:
             for level_weights, level in zip(weights, candidates, strict=True):
                 _check_tensors(why, rays, *_edges(level), level_weights)
             if len(rays.origins):
-                check_intervals(rays, packed(ray_samples))
+                kit.check_intervals(rays, packed(ray_samples))
             case.colours(sampler, rays, field).sum().backward()
             check_gradients(field, why)
 
 
 @checks("update-while-frozen-is-harmless", "proposal")
 def update_while_frozen_is_harmless(case: ProposalCase) -> None:
-    """The callbacks of hosts that train proposal networks are accepted, and change no decision."""
-    sampler, rays = case.shared(SLAB), crossing()
+    sampler, rays = case.shared(SLAB), kit.crossing()
     before = case.sample(sampler, rays)
     sampler.train()
     for step, anneal in ((0, 0.0), (100, 0.3), (2000, 1.0)):
@@ -343,4 +319,4 @@ def update_while_frozen_is_harmless(case: ProposalCase) -> None:
         case.sample(sampler, rays)
     after = case.sample(sampler.eval(), rays)
     if case.needs_occupancy:
-        require(same(before, after), "set_anneal and step_cb changed what is sampled")
+        require(kit.same(before, after), "set_anneal and step_cb changed what is sampled")

@@ -18,20 +18,9 @@ import torch
 import torch.multiprocessing as processes
 from torch import Tensor, nn
 
+from leco_plugin.conformance import scene as kit
 from leco_plugin.conformance.rules import Broken, Case, checks, require
-from leco_plugin.conformance.scene import (
-    EVERYTHING,
-    OTHER,
-    PARTS,
-    SLAB,
-    Field,
-    Rays,
-    Slab,
-    check_inside,
-    crossing,
-    cut_short,
-    same,
-)
+from leco_plugin.conformance.scene import SLAB, Field, Rays, Slab
 from leco_plugin.models.encodings import Kind
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.marching import Samples
@@ -134,10 +123,9 @@ def check_gradients(field: Field, why: str) -> None:
 
 @checks("deterministic-in-eval", *BOTH)
 def deterministic_in_eval(case: SamplerCase) -> None:
-    """Evaluation does not depend on random numbers."""
-    sampler, rays = case.shared(SLAB), crossing()
+    sampler, rays = case.shared(SLAB), kit.crossing()
     one, other = of_two_seeds(lambda seed: case.sample(sampler, rays, seed=seed))
-    require(same(one, other), "two calls in evaluation mode return different samples")
+    require(kit.same(one, other), "two calls in evaluation mode return different samples")
 
 
 def of_two_seeds(evaluate: Callable[[int], Any]) -> tuple[Any, Any]:
@@ -151,19 +139,20 @@ def of_two_seeds(evaluate: Callable[[int], Any]) -> tuple[Any, Any]:
 
 def check_shifts(case: SamplerCase) -> None:
     """Raises unless samples shift in training, and stay between the ends of each ray."""
-    sampler, rays = case.shared(SLAB).train(), cut_short()
+    sampler, rays = case.shared(SLAB).train(), kit.cut_short()
     one, other = (case.sample(sampler, rays, seed=seed) for seed in (1, 2))
-    require(not same(one, other), "two calls in training return the same samples")
+    require(not kit.same(one, other), "two calls in training return the same samples")
     for samples in (one, other):
-        check_inside(rays, samples)
+        kit.check_inside(rays, samples)
 
 
 @checks("no-gradient-to-the-gate", *BOTH)
 def no_gradient_to_the_gate(case: SamplerCase) -> None:
-    """A loss on rendered colours moves the host's field, and never the frozen gate."""
     sampler, field = case.shared(SLAB).train(), Field()
-    origins, directions = (part.clone().requires_grad_() for part in crossing()[:2])
-    rays = crossing()._replace(origins=origins, directions=directions)  # cameras may be optimised
+    origins, directions = (part.clone().requires_grad_() for part in kit.crossing()[:2])
+    rays = kit.crossing()._replace(
+        origins=origins, directions=directions
+    )  # cameras may be optimised
     colours = case.colours(sampler, rays, field)
     require(torch.is_grad_enabled(), "sampling leaves gradients switched off")
     colours.square().sum().backward()
@@ -175,20 +164,22 @@ def no_gradient_to_the_gate(case: SamplerCase) -> None:
         require(not parameter.requires_grad, f"the gate's {name} is no longer frozen")
         require(parameter.grad is None, f"the gate's {name} was given a gradient")
     samples = case.sample(sampler, rays)
-    carrying = [name for name, part in zip(PARTS, samples, strict=True) if part.requires_grad]
+    carrying = [name for name, part in zip(kit.PARTS, samples, strict=True) if part.requires_grad]
     require(not carrying, f"{' and '.join(carrying)} carry a gradient")
 
 
 @checks("state-dict-round-trip", *BOTH)
 def state_dict_round_trip(case: SamplerCase) -> None:
     """The checkpoint of one scene turns a sampler of another scene into the first."""
-    source, rays = case.shared(EVERYTHING), crossing()
-    restored = case.build(OTHER.occupancy(case.gate_encoding) if case.needs_occupancy else None)
-    case.sample(restored.eval(), rays, OTHER)  # what is derived at first use is of the other scene
+    source, rays = case.shared(kit.EVERYTHING), kit.crossing()
+    restored = case.build(kit.OTHER.occupancy(case.gate_encoding) if case.needs_occupancy else None)
+    case.sample(
+        restored.eval(), rays, kit.OTHER
+    )  # what is derived at first use is of the other scene
     restored.load_state_dict(reloaded(source.state_dict()))
-    samples = case.sample(restored.eval(), rays, EVERYTHING)
+    samples = case.sample(restored.eval(), rays, kit.EVERYTHING)
     require(
-        same(samples, case.sample(source, rays, EVERYTHING)),
+        kit.same(samples, case.sample(source, rays, kit.EVERYTHING)),
         "a sampler that was restored from a checkpoint samples otherwise than the one it is of",
     )
 
@@ -203,15 +194,16 @@ def reloaded(state: Any) -> Any:
 
 @checks("two-processes", *BOTH)
 def two_processes(case: SamplerCase) -> None:
-    """Two ranks that train side by side sample alike."""
     work = functools.partial(samples_after_a_step, type(case), case.name)
     one, other = on_two_ranks(work, case.imports)
-    require(same(one, other), "two ranks with the same buffers sample the same rays differently")
+    require(
+        kit.same(one, other), "two ranks with the same buffers sample the same rays differently"
+    )
 
 
 def samples_after_a_step(kind: type[SamplerCase], name: str, rank: int) -> Samples:
     """Samples in evaluation after a training step on the rank's own rays."""
-    case, rays = kind(name), crossing()
+    case, rays = kind(name), kit.crossing()
     sampler = case.shared(SLAB).train()
     own = Rays(*(tensor[rank::2] for tensor in rays))
     case.colours(sampler, own, Field()).sum().backward()

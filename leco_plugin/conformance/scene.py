@@ -15,16 +15,8 @@ import torch
 from torch import Tensor, nn
 
 from leco_plugin.conformance.rules import Broken, require
-from leco_plugin.models.encodings import (
-    Encoding,
-    EncodingConfig,
-    FrequencyEncoding,
-    GridEncoding,
-    HashEncoding,
-    Kind,
-    KPlanesEncoding,
-    VectorMatrixEncoding,
-)
+from leco_plugin.models import encodings
+from leco_plugin.models.encodings import Encoding, EncodingConfig, Kind
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.base import DenseEstimator
@@ -262,24 +254,24 @@ def write_linear(encoding: Encoding, normal: Tensor) -> Tensor:
     weights = torch.zeros(encoding.out_dim)
     ends = torch.tensor([-1.0, 1.0])
     across = normal[0] * ends + normal[1] * ends[:, None]  # rows are along y, columns along x
-    if isinstance(encoding, FrequencyEncoding):
+    if isinstance(encoding, encodings.FrequencyEncoding):
         weights[:3] = normal
-    elif isinstance(encoding, HashEncoding):
+    elif isinstance(encoding, encodings.HashEncoding):
         axis = torch.linspace(-1.0, 1.0, int(encoding.resolutions[0]) + 1)
         corners = torch.cartesian_prod(axis, axis, axis)
         rows = encoding.rows_and_weights(corners)[0][:, 0].long()
         encoding.table[rows, 0] = corners @ normal
         weights[0] = 1.0
-    elif isinstance(encoding, VectorMatrixEncoding):
+    elif isinstance(encoding, encodings.VectorMatrixEncoding):
         encoding.planes[0, 0], encoding.lines[0, 0] = across, 1.0
         encoding.planes[0, 1], encoding.lines[0, 1, :, 0] = 1.0, normal[2] * ends
         weights[:2] = 1.0
-    elif isinstance(encoding, KPlanesEncoding):
+    elif isinstance(encoding, encodings.KPlanesEncoding):
         (planes,) = encoding.planes
         planes.fill_(1.0)
         planes[0, 0], planes[1, 1] = across, normal[2] * ends[:, None]
         weights[:2] = 1.0
-    elif isinstance(encoding, GridEncoding):
+    elif isinstance(encoding, encodings.GridEncoding):
         encoding.table[0, 0] = across + normal[2] * ends[:, None, None]
         weights[0] = 1.0
     return weights

@@ -22,8 +22,6 @@ LOWEST_CAP = 0.1
 
 @checks("visibility-pruning", "estimator")
 def visibility_pruning(case: EstimatorCase) -> None:
-    """With a density or opacity, what light does not reach and what is too faint is dropped, and
-    nothing else."""
     rays, sampler = crossing(), case.shared(EVERYTHING)
     for training in (False, True):
         sampler.train(training)

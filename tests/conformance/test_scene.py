@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from leco_plugin.conformance import scene
-from leco_plugin.conformance.proposals import chords, cut_short
+from leco_plugin.conformance.proposals import chords
 from leco_plugin.models.encodings import Kind
 from leco_plugin.occupancy import Occupancy
 
@@ -67,7 +67,7 @@ def test_rays_from_within_begin_in_the_box_and_leave_it_also_along_each_axis():
 
 
 def test_a_chord_ends_where_the_slab_does_to_a_hundredth():
-    rays = cut_short()
+    rays = scene.cut_short()
     enters, leaves = chords(rays)
     met = leaves > enters
     assert met.any()
