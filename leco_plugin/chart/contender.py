@@ -69,8 +69,6 @@ class Contender:
 
 @dataclass(frozen=True)
 class Job:
-    """One run to be made."""
-
     contender: Contender
     seed: int
 
@@ -81,7 +79,6 @@ class Job:
 
     @property
     def values(self) -> dict[str, Any]:
-        """What it is, as JSON values."""
         return {"contender": asdict(self.contender), "seed": self.seed}
 
 
@@ -231,11 +228,9 @@ class Protocol:
         return Budget(self.seconds, self.steps, learning)
 
     def threads(self, of_machine: int) -> int:
-        """Threads of each run."""
         return max(1, of_machine // self.at_once)
 
     def describe(self) -> str:
-        """Time and steps in a few words."""
         seconds = [] if self.seconds is None else [f"{self.seconds:g} s"]
         steps = [] if self.steps is None else [counted(self.steps, "step")]
         return " or ".join(seconds + steps)

@@ -23,14 +23,12 @@ class Learned(Line):
     @cached_property
     def facts(self) -> list[dict[str, Any]]:
         """Of each seed with a frozen gate: its run's `occupancy`, with figures as of the moment of
-        freezing, and all as they are `at_end`; its `seed`; and whether it was frozen `at_the_end`.
-        """
+        freezing, and all as they are `at_end`; and whether it was frozen `at_the_end`."""
         return [
             {
                 **run["occupancy"],
                 **(run.get("at_freezing") or {}),
                 "at_end": run["occupancy"],
-                "seed": run["seed"],
                 "at_the_end": run["freeze_seconds"] >= AT_THE_END * run["train_seconds"],
             }
             for run in self.runs
@@ -84,6 +82,11 @@ def learned_of(lines: Sequence[Line]) -> list[Learned]:
     return found if any(one.facts for one in found) else []
 
 
+def not_always_frozen(lines: Sequence[Line]) -> list[str]:
+    """Contenders that learn an occupancy whose gate was not frozen and measured in every run."""
+    return [one.name for one in learned_of(lines) if not one.is_measured]
+
+
 def learned_headline(learned: Sequence[Learned], short: bool = False) -> str:
     """Space kept at equal loss and PSNR of ours, or of the first that always froze, and which other
     is better in both: medians of space and means of PSNR. A short one leaves out the other others.
@@ -112,7 +115,6 @@ def learned_headline(learned: Sequence[Learned], short: bool = False) -> str:
 
 
 def _standing_of(one: Learned, others: Sequence[Learned]) -> str:
-    """The standing of one that no other beats in both."""
     found = [words_of(one, other) for other in others]
     fewest = min(others, key=lambda other: other.seeds)
     by = compare(one.psnrs, fewest.psnrs).by
@@ -129,7 +131,6 @@ def words_of(one: Learned, other: Learned) -> set[str | None]:
 
 
 def ours_of(learned: Sequence[Learned]) -> Learned | None:
-    """The one that a suite asks about."""
     return next((one for one in learned if OURS in one.name), None)
 
 

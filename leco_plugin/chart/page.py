@@ -55,7 +55,6 @@ def write_page(results: Mapping[str, Any], path: Path) -> Path:
 
 
 def _add_curves(figure: Any, lines: Sequence[Line]) -> None:
-    """The curve of each run, and the best so far of all."""
     for i, line in enumerate(lines):
         for run in line.runs:
             seconds, psnrs = zip(*run["curve"])

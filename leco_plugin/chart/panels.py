@@ -6,11 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from leco_plugin.chart.learned import learned_headline, learned_of
+from leco_plugin.chart.learned import learned_headline, learned_of, not_always_frozen
 from leco_plugin.chart.representations import (
     SPARSE,
     Representation,
-    never_held_of,
     representations_of,
     shortest_verdict,
     verdict,
@@ -35,7 +34,7 @@ def finding_of(results: Mapping[str, Any], short: bool = False) -> str:
     a title, has about ten words."""
     lines = lines_of(results)
     if held := representations_of(lines):
-        never = 0 if short else len(never_held_of(lines))
+        never = 0 if short else len(not_always_frozen(lines))
         said = shortest_verdict(held) if short else verdict(held)
         return sentence(said) + (f"; {never} not always frozen" if never else "")
     if asks_what_was_learned(results):
@@ -85,8 +84,6 @@ class Panel:
 
 @dataclass(frozen=True)
 class Shown:
-    """What picture and page show of results."""
-
     lines: list[Line]
     costs: list[Panel]
     """PSNR against each cost."""
@@ -107,7 +104,6 @@ def shown_of(results: Mapping[str, Any]) -> Shown:
 
 
 def cost_panel(cost: Cost, lines: Sequence[Line]) -> Panel:
-    """PSNR against a cost."""
     points = [
         Point(line.name, value, line.psnr, i, tuple((value, psnr) for psnr in line.psnrs))
         for i, line in enumerate(lines)

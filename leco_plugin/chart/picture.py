@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from leco_plugin.chart.learned import learned_of
+from leco_plugin.chart.learned import not_always_frozen
 from leco_plugin.chart.panels import Panel, Point, Shown, finding_of, shown_of
 from leco_plugin.chart.summary import (
     LEARNING,
@@ -105,7 +105,7 @@ def _draw_occupancies(figure: Any, top: float, shown: Shown, theme: Theme) -> No
     by_psnr = first.more_x
     better = ", against PSNR. Up and right is better:" if by_psnr else ". Up and left is better:"
     figure.text(0.015, top - 0.035, KEPT_SPACE + better, va="top", fontsize=11.5)
-    if by_psnr and (never := [one.name for one in learned_of(lines) if not one.is_measured]):
+    if by_psnr and (never := not_always_frozen(lines)):
         said = textwrap.fill(f"Not always frozen: {', '.join(never)}.", 100)
         figure.text(0.015, top - 0.07, said, va="top", fontsize=11.5)
         top -= 0.035 * (said.count("\n") + 1)

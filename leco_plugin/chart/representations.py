@@ -55,11 +55,9 @@ class Representation:
 
     @property
     def is_grid(self) -> bool:
-        """Whether it is an occupancy grid."""
         return not self.has("learn_seconds")
 
     def is_small_of(self, large: Representation) -> bool:
-        """Whether it is the small gate of the kind of a large one."""
         return self.kind is not None and ((self.ours and large.ours) or self.kind == large.name)
 
     def of_seeds(self, figure: str) -> list[float]:
@@ -108,15 +106,6 @@ def representations_of(lines: Sequence[Line]) -> list[Representation]:
 def keeps_all(row: Mapping[str, Any]) -> bool:
     """Whether what was measured of a representation is that it holds nothing."""
     return bool(row["kept_reached_volume"] >= 1.0)
-
-
-def never_held_of(lines: Sequence[Line]) -> list[str]:
-    """Contenders whose gate was not frozen and measured in every run, and is left out."""
-    return [
-        line.name
-        for line in lines
-        if line.learned and not all(_held_in(run, line) for run in line.runs)
-    ]
 
 
 def _held_in(run: Mapping[str, Any], line: Line) -> dict[_What, Held]:
@@ -177,8 +166,10 @@ def shortest_verdict(representations: Sequence[Representation]) -> str:
         if all(one.kept <= other.kept for other in representations):
             return f"{one.name} keeps least space, {one.kept:.1f}%"
     for one in ours:
-        if _is_smallest(one, representations):
-            return f"{one.name} is the smallest occupancy: {one.median('size'):.0f} kB"
+        size, others = one.median("size"), [other for other in representations if other is not one]
+        apart = [other for other in others if not one.against(other, "size").is_open]
+        if apart == others and all(other.median("size") > size for other in others):
+            return f"{one.name} is the smallest occupancy: {size:.0f} kB"
     for one in ours:
         if fronts := fronts_of(one, representations):
             as_cheap = " or ".join(AS_CHEAP[name] for name in fronts)
@@ -206,14 +197,6 @@ def _standing_of(one: Representation, all_of_them: Sequence[Representation]) -> 
         if name not in fronts
     ]
     return f"{one.name}: {'; '.join(parts)}"
-
-
-def _is_smallest(one: Representation, all_of_them: Sequence[Representation]) -> bool:
-    return all(
-        other.median("size") > one.median("size") and not one.against(other, "size").is_open
-        for other in all_of_them
-        if other is not one
-    )
 
 
 def _best_ahead(one: Representation, others: Sequence[Representation], figure: str) -> str:

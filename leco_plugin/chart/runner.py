@@ -285,7 +285,6 @@ class ProcessRunner:
 
 
 def _reason(work: Path, status: int, log: Path) -> str:
-    """Why there is no result, in one line."""
     if (work / FAILURE).exists():
         return str(json.loads((work / FAILURE).read_text())["reason"])
     if status < 0:

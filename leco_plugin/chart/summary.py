@@ -111,7 +111,6 @@ class Cost:
 
     @property
     def titled(self) -> str:
-        """Its title with its unit, if it has one."""
         return f"{self.title}, {self.unit}" if self.unit else self.title
 
 

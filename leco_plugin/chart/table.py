@@ -8,13 +8,12 @@ from functools import partial
 from typing import Any, TypeVar
 
 from leco_plugin.chart import summary
-from leco_plugin.chart.learned import Learned, falls, learned_of, settling
+from leco_plugin.chart.learned import Learned, falls, learned_of, not_always_frozen, settling
 from leco_plugin.chart.panels import cost_panel, finding_of
 from leco_plugin.chart.representations import (
     Representation,
     fronts_of,
     keeps_all,
-    never_held_of,
     representations_of,
 )
 from leco_plugin.chart.summary import Cost, Line, Versus
@@ -269,7 +268,7 @@ def representations_table(held: Sequence[Representation]) -> str:
 def left_out(lines: Sequence[Line]) -> list[str]:
     """Sentences about gates and grids that are not in the table of representations."""
     said = []
-    if names := never_held_of(lines):
+    if names := not_always_frozen(lines):
         said.append(f"Left out, for not frozen with every seed: {', '.join(names)}.")
     measured = summary.at_equal_loss(lines)
     sizes = {size for one in measured for size in one.get("left_out", ())}

@@ -10,17 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from leco_plugin.conformance import samplers
 from leco_plugin.conformance import scene as kit
 from leco_plugin.conformance.rules import checks, raises_nothing, require
-from leco_plugin.conformance.samplers import (
-    SamplerCase,
-    check_gradients,
-    check_module,
-    check_rays,
-    check_shifts,
-    check_tensor,
-    devices,
-)
+from leco_plugin.conformance.samplers import SamplerCase
 from leco_plugin.conformance.scene import SLAB, Field, Rays, Slab
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.base import Estimator
@@ -83,7 +76,7 @@ NEAR, FAR = 2.5, 3.4
 @checks("signature", "estimator")
 def signature(case: EstimatorCase) -> None:
     sampler = case.shared(SLAB)
-    check_module(sampler, "sampling", "update_every_n_steps")
+    samplers.check_module(sampler, "sampling", "update_every_n_steps")
     offered = list(inspect.signature(sampler.sampling).parameters.values())
     takes_anything = {inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD}
     if not takes_anything <= {parameter.kind for parameter in offered}:
@@ -99,12 +92,12 @@ def signature(case: EstimatorCase) -> None:
 
 @checks("shapes-types-devices", "estimator")
 def shapes_types_devices(case: EstimatorCase) -> None:
-    for device in devices():
+    for device in samplers.devices():
         sampler, rays = case.shared(SLAB).to(device), kit.crossing().to(device)
         for training in (False, True):
             given = rays.copied()
             samples = case.ask(sampler.train(training), given)
-            check_rays(given, rays)
+            samplers.check_rays(given, rays)
             shapes = [list(part.shape) for part in samples]
             require(
                 len(shapes[0]) == 1 and shapes[0] == shapes[1] == shapes[2] and shapes[0][0] > 0,
@@ -113,7 +106,7 @@ def shapes_types_devices(case: EstimatorCase) -> None:
             where = samples[0].device
             require(where == rays.origins.device, f"{kit.PARTS[0]} is on {where}")
             for name, part in zip(kit.PARTS[1:], samples[1:], strict=True):
-                check_tensor(name, part, rays.origins)
+                samplers.check_tensor(name, part, rays.origins)
         sampler.to("cpu")
 
 
@@ -175,7 +168,7 @@ def packing_consistent(case: EstimatorCase) -> None:
 
 @checks("stratified-in-training", "estimator")
 def stratified_in_training(case: EstimatorCase) -> None:
-    check_shifts(case)
+    samplers.check_shifts(case)
     sampler, rays = case.shared(kit.EVERYTHING).train(), kit.crossing(kit.MANY)
     ray_indices, t_starts, _ = kit.in_order(
         case.sample(sampler, rays, render_step_size=kit.LONG_STEP)
@@ -226,7 +219,7 @@ def zero_samples_well_formed(case: EstimatorCase) -> None:
                 shown = torch.allclose(colours, background)
                 require(shown, f"{why}: the background is not what is rendered")
                 colours.sum().backward()
-                check_gradients(field, why)
+                samplers.check_gradients(field, why)
 
 
 ALLOWED_DIFFERENCE = 0.005

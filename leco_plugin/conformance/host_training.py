@@ -158,7 +158,6 @@ class Run:
         return float(loss.detach())
 
     def loss(self, step: int) -> Tensor:
-        """The loss of a step."""
         return hosts.loss_of(self.model, hosts.bundle(), hosts.batch())
 
     def _call(self, step: int, location: TrainingCallbackLocation) -> None:
@@ -182,7 +181,6 @@ class Run:
         self.optimizers.load_schedulers(state["schedulers"])
 
     def parameters(self) -> dict[str, Tensor]:
-        """Copies of the parameters."""
         return {name: p.detach().clone() for name, p in self.model.named_parameters()}
 
 

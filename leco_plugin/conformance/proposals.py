@@ -8,17 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from leco_plugin.conformance import samplers
 from leco_plugin.conformance import scene as kit
 from leco_plugin.conformance.rules import Broken, checks, require
-from leco_plugin.conformance.samplers import (
-    SamplerCase,
-    check_gradients,
-    check_module,
-    check_rays,
-    check_shifts,
-    check_tensor,
-    devices,
-)
+from leco_plugin.conformance.samplers import SamplerCase
 from leco_plugin.conformance.scene import SLAB, Field, Rays, Slab
 from leco_plugin.log import counted
 from leco_plugin.occupancy import Occupancy
@@ -127,7 +120,7 @@ UNEVEN = 1.5
 @checks("signature", "proposal")
 def signature(case: ProposalCase) -> None:
     sampler = case.shared(SLAB)
-    check_module(sampler, "set_anneal", "step_cb")
+    samplers.check_module(sampler, "set_anneal", "step_cb")
     density = no_density if case.needs_occupancy else None
     ray_samples, weights, candidates = case.answer(sampler, kit.crossing(), density=density)
     found = type(ray_samples).__name__
@@ -138,11 +131,11 @@ def signature(case: ProposalCase) -> None:
 
 @checks("shapes-types-devices", "proposal")
 def shapes_types_devices(case: ProposalCase) -> None:
-    for device in devices():
+    for device in samplers.devices():
         sampler, rays = case.shared(SLAB).to(device), kit.crossing().to(device)
         given = rays.copied()
         ray_samples, weights, candidates = case.ask(sampler, ray_bundle(given))
-        check_rays(given, rays)
+        samplers.check_rays(given, rays)
         require(
             len(weights) == len(candidates) == LEVELS,
             f"{LEVELS} density_fns got {len(weights)} weights and {len(candidates)} samples",
@@ -189,7 +182,7 @@ def _check_tensors(where: str, rays: Rays, *tensors: Tensor) -> None:
         f"{where}: shapes {shapes}, expected [{len(rays.origins)}, n_samples, 1]",
     )
     for tensor in tensors:
-        check_tensor(f"{where}: a tensor", tensor, rays.origins)
+        samplers.check_tensor(f"{where}: a tensor", tensor, rays.origins)
 
 
 @checks("sorted-disjoint-inside", "proposal")
@@ -262,11 +255,6 @@ def chords(rays: Rays, scene: Slab = SLAB) -> tuple[Tensor, Tensor]:
     return t[first] * met, t[last] * met
 
 
-@checks("stratified-in-training", "proposal")
-def stratified_in_training(case: ProposalCase) -> None:
-    check_shifts(case)
-
-
 @checks("all-kept-equals-dense", "proposal")
 def all_kept_equals_dense(case: ProposalCase) -> None:
     rays = kit.cut_short()  # which lie within the box: outside it nothing is occupied
@@ -305,7 +293,7 @@ def zero_samples_well_formed(case: ProposalCase) -> None:
             if len(rays.origins):
                 kit.check_intervals(rays, packed(ray_samples))
             case.colours(sampler, rays, field).sum().backward()
-            check_gradients(field, why)
+            samplers.check_gradients(field, why)
 
 
 @checks("update-while-frozen-is-harmless", "proposal")

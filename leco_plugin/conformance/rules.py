@@ -114,7 +114,6 @@ class Verdict:
         return start if self.passed else f"{start}: {self.advice}"
 
     def to_dict(self) -> dict[str, str | bool]:
-        """The verdict as JSON values."""
         return {
             "rule": self.rule.name,
             "seam": self.seam,

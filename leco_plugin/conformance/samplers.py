@@ -137,6 +137,7 @@ def of_two_seeds(evaluate: Callable[[int], Any]) -> tuple[Any, Any]:
     return one, other
 
 
+@checks("stratified-in-training", "proposal")
 def check_shifts(case: SamplerCase) -> None:
     """Raises unless samples shift in training, and stay between the ends of each ray."""
     sampler, rays = case.shared(SLAB).train(), kit.cut_short()

@@ -64,7 +64,6 @@ class Rays(NamedTuple):
         return self.origins[ray_indices] + self.directions[ray_indices] * t[:, None]
 
     def to(self, device: torch.device) -> Rays:
-        """The same on another device."""
         return Rays(*(tensor.to(device) for tensor in self))
 
     def copied(self) -> Rays:
