@@ -257,7 +257,6 @@ def _losses(itself: Rung) -> str:
 
 
 def line_of(rung: Rung) -> str:
-    """A gate as a line of the table."""
     price = "     -" if rung.image_price_db is None else f"{rung.image_price_db:+6.3f}"
     return (
         f"{rung.name:<28}{rung.params:>8} values {rung.bytes / 1000:>7.1f} kB  loses "
@@ -338,7 +337,6 @@ def draw_gates(results: Mapping[str, Any], path: Path) -> Path:
 
 
 def headline(results: Mapping[str, Any]) -> str:
-    """What came out, in a line."""
     before, after = results["from"], results["to"]
     if not _is_chosen(results):
         return f"{before['bytes'] / 1000:.1f} kB, and nothing smaller holds the bounds"

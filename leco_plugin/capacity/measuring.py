@@ -315,7 +315,6 @@ def _stored(out: Path, candidate: Candidate) -> dict[str, Any] | None:
 
 
 def line_of(row: dict[str, Any]) -> str:
-    """A representation as a line of the table."""
     return (
         f"{row['family']:<10} {row['size']:<10} {kilobytes(row):>10}  keeps "
         f"{row['kept_volume']:>6.2%} of the volume"

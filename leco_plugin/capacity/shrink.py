@@ -13,31 +13,12 @@ from typing import Any
 
 import torch
 
+from leco_plugin.capacity import references, sources
 from leco_plugin.capacity.choice import line_of, line_of_lowered, line_of_original
 from leco_plugin.capacity.evidence import gather
-from leco_plugin.capacity.references import (
-    HOLDS,
-    LOST_DECISIONS,
-    Bounds,
-    Ground,
-    Rung,
-    declared,
-    find_references,
-    measure_original,
-    measure_shares_lost,
-    pair_sides,
-    verify,
-)
+from leco_plugin.capacity.references import HOLDS, LOST_DECISIONS, Bounds, Ground, Rung
 from leco_plugin.capacity.search import Found, kept_of_box, lower_threshold, search
-from leco_plugin.capacity.sources import (
-    Seen,
-    Source,
-    check_scene,
-    draw_held_out,
-    draw_test_rays,
-    draw_training_rays,
-    find_source,
-)
+from leco_plugin.capacity.sources import Seen, Source
 from leco_plugin.evaluation.clock import synchronize
 from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.evaluation.report import describe_code, describe_machine, made_by
@@ -121,8 +102,8 @@ def _open(file: Path, data: Path, out: Path, bounds: Bounds) -> tuple[Source, Oc
     _check_original(original, file, bounds)
     random.seed(0)  # nerfstudio caches images in an order of its own
     torch.manual_seed(0)
-    source = find_source(file, data)
-    check_scene(source, original, data)
+    source = sources.find_source(file, data)
+    sources.check_scene(source, original, data)
     check_losses(source, original, file, bounds)
     return source, original.to(source.manager.device)
 
@@ -134,7 +115,7 @@ def _meet_bounds(
     far its threshold was lowered to lose less."""
     drawn = draw_rays(source, original)
     ground = prepare(source, original, *drawn)
-    itself = measure_original(ground, bounds)
+    itself = references.measure_original(ground, bounds)
     put(line_of_original(itself, ground.measures_original))
     lower = lower_threshold(ground, bounds)
     if lower is None:
@@ -144,7 +125,7 @@ def _meet_bounds(
     more = round(kept_of_box(lower) / max(kept_of_box(original), 1e-12), 4)
     lowered = {"from": original.threshold, "to": lower.threshold, "kept_volume": more}
     ground = prepare(source, lower, *drawn)
-    itself = measure_original(ground, bounds)
+    itself = references.measure_original(ground, bounds)
     put(line_of_lowered(itself, lowered))
     skipped = 1.0 - float(ground.references[0].search.evidence.kept.double().mean())
     if skipped < HARDLY_ANYTHING:
@@ -171,7 +152,7 @@ def _find_smaller(
         return found, found.occupancy
     if ground.measures_original:
         looks = max((rung.look or 0 for rung in found.rungs), default=0)
-        verify(ground, original, bounds, itself, looks + 1)
+        references.verify(ground, original, bounds, itself, looks + 1)
     if original.precision == "bfloat16":
         round_weights(original.gate.hidden)
     return found, original
@@ -179,16 +160,16 @@ def _find_smaller(
 
 def draw_rays(source: Source, original: Occupancy) -> tuple[Sequence[tuple[Seen, Seen]], Seen]:
     """Rays to search on and to verify on, of held-out pixels and others; and rays to teach by."""
-    sides = pair_sides(source, original, draw_held_out(source, original, RAYS))
-    return sides, draw_training_rays(source, original, TAUGHT_RAYS)
+    sides = references.pair_sides(source, original, sources.draw_held_out(source, original, RAYS))
+    return sides, sources.draw_training_rays(source, original, TAUGHT_RAYS)
 
 
 def prepare(
     source: Source, original: Occupancy, sides: Sequence[tuple[Seen, Seen]], taught_on: Seen
 ) -> Ground:
     """What gates are taught and measured on; `ValueError` where nothing there is worth anything."""
-    references = find_references(source, original, sides)
-    parts = [part.evidence for one in references for part in (one.search, one.verify)]
+    found = references.find_references(source, original, sides)
+    parts = [part.evidence for one in found for part in (one.search, one.verify)]
     if not all(bool(part.kept.any()) for part in parts[:2]):
         raise ValueError(
             "the occupancy keeps nothing on the rays of these photographs: they are of another "
@@ -203,7 +184,7 @@ def prepare(
     if source.frozen is not None:  # a candidate weighs what it weighs in any of the fields
         before, _ = gather(source.frozen, None, taught_on)
         taught = taught._replace(weights=taught.weights.maximum(before.weights))
-    return Ground(original, taught, references)
+    return Ground(original, taught, found)
 
 
 def _check_original(original: Occupancy, file: Path, bounds: Bounds) -> None:
@@ -248,7 +229,7 @@ def check_losses(source: Source, original: Occupancy, file: Path, bounds: Bounds
         ("lost_surface_mass", "declares a lost surface mass of {:.2e}", most, ""),
         ("image_price_db", "declares an image price of {:.3f} dB", bounds.image_price_db, ""),
     ):
-        lost = declared(original, name)
+        lost = references.declared(original, name)
         if not lost < limit:  # nor is NaN
             option = "--image-price" if name == "image_price_db" else "--lost-surface-mass"
             raise ValueError(
@@ -262,8 +243,8 @@ def _check_on_test_photographs(
 ) -> dict[str, Any] | None:
     """What the smaller gate loses on rays of test photographs, which decided nothing here: worst of
     all references, and by each. None without such photographs, or where nothing measures it."""
-    seen = draw_test_rays(source, original, RAYS)
-    shares = {} if seen is None else measure_shares_lost(source, original, smaller, seen)
+    seen = sources.draw_test_rays(source, original, RAYS)
+    shares = {} if seen is None else references.measure_shares_lost(source, original, smaller, seen)
     if seen is None or not shares:
         return None
     lost = _named_loss(source.model is None, max(shares.values()))

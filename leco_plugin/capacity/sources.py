@@ -145,7 +145,6 @@ def draw_held_out(source: Source, occupancy: Occupancy, count: int, parts: int =
 
 
 def draw_training_rays(source: Source, occupancy: Occupancy, count: int) -> Seen:
-    """Rays of training pixels."""
     bundle, batch = _next_batch(source, count)
     return _see(source, occupancy, bundle, batch["image"])
 

@@ -62,7 +62,6 @@ class HeldOutPsnr:
         return held_out_sampler(self.manager) is not None
 
     def look(self) -> None:
-        """Measures where that is due."""
         now = time.monotonic()
         old = now >= self.due - BETWEEN + OLD and self.cost <= SHARE_WHEN_OLD * OLD
         affordable = old or self.spent + self.cost <= SHARE_OF_TIME * (now - self.began)

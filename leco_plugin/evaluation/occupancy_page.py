@@ -12,14 +12,8 @@ from PIL import Image
 from torch import Tensor
 
 from leco_plugin.chart.theme import LIGHT, write_page_file
-from leco_plugin.evaluation.inspection import (
-    SceneColours,
-    ViewBox,
-    cameras_of,
-    query,
-    seen_at,
-    whole_box,
-)
+from leco_plugin.evaluation import inspection
+from leco_plugin.evaluation.inspection import SceneColours, ViewBox
 from leco_plugin.evaluation.occupancy_picture import (
     heights_seen_from_above,
     interesting_box,
@@ -51,7 +45,7 @@ def write_page(occupancy: Occupancy, path: Path, colours: SceneColours | None = 
     """
     import plotly.graph_objects as plotly
 
-    cameras = cameras_of(occupancy)
+    cameras = inspection.cameras_of(occupancy)
     box = interesting_box(occupancy, cameras)
     lowest, highest = heights_seen_from_above(occupancy, box)
     faces = _kept_faces(occupancy, box, lowest)
@@ -65,9 +59,9 @@ def write_page(occupancy: Occupancy, path: Path, colours: SceneColours | None = 
     if len(cameras):
         look = {"size": 3, "color": LIGHT.colours[1]}
         _add_lines(figure, cameras, "cameras", mode="markers", marker=look)
-    whole = whole_box(occupancy)
+    whole = inspection.whole_box(occupancy)
     _add_lines(figure, _edges(whole), "bounds", line={"color": "#8a8f98", "width": 2})
-    seen = seen_at(occupancy, whole.middles(SEEN_CELLS))
+    seen = inspection.seen_at(occupancy, whole.middles(SEEN_CELLS))
     unseen = faces_of(~seen, whole, beyond=False)
     if len(unseen):
         look = {"color": "#8a8f98", "opacity": 0.25, "visible": "legendonly"}
@@ -109,7 +103,7 @@ def _kept_faces(occupancy: Occupancy, box: ViewBox, lowest: float) -> Tensor:
     cells as small as `MOST_FACES` allows."""
     for cells in CELLS:
         positions = box.middles(cells)
-        kept = query(occupancy, positions) >= occupancy.threshold
+        kept = inspection.query(occupancy, positions) >= occupancy.threshold
         faces = faces_of(kept, box, beyond=True)
         margin = 2.0 * float((box.high - box.low).max()) / cells
         faces = faces[faces[..., 2].amax(dim=1) > lowest - margin]

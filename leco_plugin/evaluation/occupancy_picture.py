@@ -12,15 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from leco_plugin.chart.theme import LIGHT, Theme, new_figure, save_whole, themed
-from leco_plugin.evaluation.inspection import (
-    SceneColours,
-    ViewBox,
-    cameras_of,
-    exposed,
-    query,
-    seen_at,
-    whole_box,
-)
+from leco_plugin.evaluation import inspection
+from leco_plugin.evaluation.inspection import SceneColours, ViewBox
 from leco_plugin.occupancy import CALIBRATED_AT, Occupancy
 from leco_plugin.scenes.bounds import FAR_CAMERA, distances_from_middle
 
@@ -71,7 +64,7 @@ def draw(
 
 
 def _figure(occupancy: Occupancy, colours: SceneColours | None, theme: Theme) -> Any:
-    cameras = cameras_of(occupancy)
+    cameras = inspection.cameras_of(occupancy)
     box = interesting_box(occupancy, cameras)
     low, high = heights_seen_from_above(occupancy, box)
     points, normals = surface_points(occupancy, box, low)
@@ -129,7 +122,7 @@ def draw_slice(
     positions = torch.empty(len(v), len(u), 3)
     positions[..., normal], positions[..., across] = at, u
     positions[..., up] = v[:, None]
-    values = query(occupancy, positions)
+    values = inspection.query(occupancy, positions)
     low, high = box.low.tolist(), box.high.tolist()
     extent = (low[across], high[across], low[up], high[up])
     longer = max(1.0, FLAT * float(sides[0] / sides[1]))
@@ -139,7 +132,7 @@ def draw_slice(
         axes.imshow(under, **place, aspect=longer)
         style["alpha"] = (values / SOLID).clamp(max=1.0).numpy()
     shown = axes.imshow(values.numpy(), **place, **style)
-    unseen = ~seen_at(occupancy, positions).numpy()
+    unseen = ~inspection.seen_at(occupancy, positions).numpy()
     if unseen.any():
         marked = {"colors": "none", "hatches": ["//"], "levels": [0.5, 1.5]}
         axes.contourf(u, v, unseen.astype(float), **marked).set_edgecolor(UNSEEN)
@@ -147,7 +140,10 @@ def draw_slice(
         lines = [occupancy.threshold]
         axes.contour(u, v, values, levels=lines, colors=CONTOUR, linewidths=0.7)
     if solid is not None:
-        _draw_truth(axes, u, v, solid(positions.reshape(-1, 3)).cpu().reshape(values.shape))
+        inside = solid(positions.reshape(-1, 3)).cpu().reshape(values.shape)
+        for colour, width in (("black", 1.8), (TRUTH, 0.8)):  # seen on light and on dark
+            if bool(inside.any()) and not bool(inside.all()):
+                axes.contour(u, v, inside.float(), levels=[0.5], colors=colour, linewidths=width)
     if cameras is not None and len(cameras):
         x, y = cameras[:, across], cameras[:, up]
         axes.scatter(x, y, s=9, c=CAMERA, edgecolors="black", linewidths=0.3, label="cameras")
@@ -160,13 +156,6 @@ def draw_slice(
     return shown
 
 
-def _draw_truth(axes: Any, u: Tensor, v: Tensor, inside: Tensor) -> None:
-    """Lines around what is solid in a slice, bool [V, U], at coordinates u [U] and v [V]."""
-    if bool(inside.any()) and not bool(inside.all()):
-        for colour, width in (("black", 1.8), (TRUTH, 0.8)):  # seen on light and on dark
-            axes.contour(u, v, inside.float(), levels=[0.5], colors=colour, linewidths=width)
-
-
 def middle_of(points: Tensor, box: ViewBox) -> Tensor:
     """[3] the median of points [P, 3]; the middle of the box where there are none."""
     return points.median(dim=0).values if len(points) else (box.low + box.high) / 2
@@ -175,7 +164,7 @@ def middle_of(points: Tensor, box: ViewBox) -> Tensor:
 def interesting_box(occupancy: Occupancy, cameras: Tensor) -> ViewBox:
     """The box around what is kept and the cameras, but for those far from all others, inside the
     occupancy's whole box."""
-    whole = whole_box(occupancy)
+    whole = inspection.whole_box(occupancy)
     _, positions, kept = _kept_cells(occupancy, whole, SEARCH_CELLS)
     inside = ((cameras >= whole.low) & (cameras <= whole.high)).all(dim=-1)
     if len(cameras):
@@ -209,7 +198,7 @@ def differing_heights(
     heights = torch.linspace(low, high, LAYERS)
     x, y = (box.axis(a, count) for a, count in enumerate(box.cells(LAYER_CELLS)[:2]))
     positions = torch.stack(torch.meshgrid(heights, x, y, indexing="ij"), dim=-1)[..., [1, 2, 0]]
-    kept = (query(occupancy, positions) >= occupancy.threshold).flatten(1).float()
+    kept = (inspection.query(occupancy, positions) >= occupancy.threshold).flatten(1).float()
     shares = kept.mean(dim=1)
     mixed = ((shares > 0.005) & (shares < 0.995)).nonzero()[:, 0]
     layers = kept[mixed]
@@ -240,7 +229,8 @@ def surface_points(occupancy: Occupancy, box: ViewBox, lowest: float) -> tuple[T
     """Kept positions next to skipped ones, and the directions [P, 3] in which o(x) falls there."""
     values, positions, kept = _kept_cells(occupancy, box, CELLS)
     margin = 2.0 * float((box.high - box.low).max()) / CELLS
-    chosen = (exposed(kept, beyond=True) & (positions[..., 2] > lowest - margin)).nonzero()
+    at_surface = inspection.exposed(kept, beyond=True)
+    chosen = (at_surface & (positions[..., 2] > lowest - margin)).nonzero()
     order = torch.randperm(len(chosen), generator=torch.Generator().manual_seed(0))
     chosen = chosen[order[:MOST_POINTS]]
     falls = -torch.stack(torch.gradient(values), dim=-1)
@@ -251,7 +241,7 @@ def surface_points(occupancy: Occupancy, box: ViewBox, lowest: float) -> tuple[T
 def _kept_cells(occupancy: Occupancy, box: ViewBox, longest: int) -> tuple[Tensor, Tensor, Tensor]:
     """o(x) at the middles of cells [X, Y, Z], those positions [X, Y, Z, 3], and which are kept."""
     positions = box.middles(longest)
-    values = query(occupancy, positions)
+    values = inspection.query(occupancy, positions)
     return values, positions, values >= occupancy.threshold
 
 
@@ -298,7 +288,6 @@ def title_of(occupancy: Occupancy) -> list[str]:
 
 
 def _legend(occupancy: Occupancy, cameras: Tensor, ground: bool) -> list[str]:
-    """What marks in a picture mean."""
     parts = ["threshold blue" + (", cameras green" if len(cameras) else "")]
     parts += ["under o(x): the photographs' colours seen from above"] if ground else []
     parts += [] if occupancy.seen.everywhere else ["hatched: no photograph shows it"]

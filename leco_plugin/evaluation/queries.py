@@ -42,8 +42,10 @@ def count_queries(model: nn.Module) -> Iterator[Counter[str]]:
     fields: list[nn.Module] = [module for module in model.modules() if isinstance(module, Field)]
     if isinstance(own, nn.Module) and own not in fields:
         fields.append(own)
-    methods = [(owner, _method_of(owner)) for owner in {*map(type, fields), HMoEField}]
-    methods += [(Occupancy, "query"), (Occupancy, "occupied")]
+    methods: list[tuple[type, str]] = [(Occupancy, "query"), (Occupancy, "occupied")]
+    for owner in {*map(type, fields), HMoEField}:
+        named = (name for name in ("get_density", "density", "forward") if hasattr(owner, name))
+        methods.append((owner, next(named)))
     of_model = {id(field) for field in fields}
     asking = False
 
@@ -86,11 +88,6 @@ def count_queries(model: nn.Module) -> Iterator[Counter[str]]:
         for owner, name, method in [*asked, (front_to_back, "shade_natively", in_c)]:
             stack.enter_context(patch.object(owner, name, method))
         yield count
-
-
-def _method_of(owner: type) -> str:
-    """The method that evaluates the fields of a class."""
-    return next(name for name in ("get_density", "density", "forward") if hasattr(owner, name))
 
 
 def number_of(positions: Any) -> int:

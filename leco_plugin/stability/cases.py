@@ -43,7 +43,6 @@ class Case:
     """Whether it shows that the suite can tell a failure: learned occupancy has to fail in it."""
 
     def is_about(self, sampler: str) -> bool:
-        """Whether it has something to say about a sampler."""
         is_fine = sampler == f"{GRID}-{GRIDS[-1]}"
         return (not self.only or sampler in self.only) and (self.fine_grid or not is_fine)
 

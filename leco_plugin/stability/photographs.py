@@ -19,7 +19,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.random import Generator
@@ -168,8 +168,6 @@ class Capture:
 
 @dataclass(frozen=True)
 class Shot:
-    """One picture to be taken."""
-
     name: str
     pose: Array
     """[3, 4] where the camera really is, metres, OpenGL axes."""
@@ -329,7 +327,10 @@ def _take_pictures(stage: Stage, capture: Capture, folder: Path) -> None:
         clouds.append(
             view.lens.some_points(shot.written, view.depth, seen.image, POINTS_PER_VIEW, random)
         )
-        frames.append(_frame(shot, view.lens))
+        lens, matrix = view.lens, [*shot.written.tolist(), [0.0, 0.0, 0.0, 1.0]]
+        size = {"w": lens.width, "h": lens.height, "cx": lens.width / 2, "cy": lens.height / 2}
+        focal = {"fl_x": lens.focal, "fl_y": lens.focal}
+        frames.append({"file_path": shot.file, "transform_matrix": matrix, **size, **focal})
     places, colours = map(np.concatenate, zip(*clouds))
     if len(places):
         write_points(folder / POINTS, places, colours)
@@ -344,10 +345,3 @@ def _take_pictures(stage: Stage, capture: Capture, folder: Path) -> None:
         "test_filenames": held_out,
     }
     (folder / TRANSFORMS).write_text(json.dumps(transforms, indent=1) + "\n")
-
-
-def _frame(shot: Shot, lens: Lens) -> dict[str, Any]:
-    matrix = [*shot.written.tolist(), [0.0, 0.0, 0.0, 1.0]]
-    size = {"w": lens.width, "h": lens.height, "cx": lens.width / 2, "cy": lens.height / 2}
-    focal = {"fl_x": lens.focal, "fl_y": lens.focal}
-    return {"file_path": shot.file, "transform_matrix": matrix, **size, **focal}

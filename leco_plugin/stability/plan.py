@@ -218,7 +218,6 @@ def runs_of(entries: Sequence[Entry]) -> list[Run]:
 
 
 def scenes_of(cases: Sequence[Case], sizes: Sizes) -> dict[str, tuple[Stage, Capture]]:
-    """The scenes of the cases by name."""
     return {case.scene: (STAGES.get(case.name, YARD), capture_of(case, sizes)) for case in cases}
 
 

@@ -27,8 +27,6 @@ _HORIZON, _ZENITH = np.array([0.86, 0.90, 0.94]), np.array([0.35, 0.55, 0.86])
 
 @dataclass(frozen=True)
 class Paint:
-    """How a surface looks."""
-
     colour: Triple
     """RGB in 0..1."""
     grain: float = 0.6
@@ -75,8 +73,6 @@ class Box:
 
 @dataclass(frozen=True)
 class Ball:
-    """A sphere."""
-
     centre: Triple
     radius: float
     paint: Paint
@@ -168,8 +164,6 @@ class Stage:
 
 
 class Seen(NamedTuple):
-    """What one picture shows."""
-
     image: NDArray[np.uint8]
     """[height, width, 4]."""
     depth: NDArray[np.float32]

@@ -31,22 +31,10 @@ from leco_plugin.scenes.city.folder import TRANSFORMS
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import describe_scene
 from leco_plugin.scenes.whole_files import alone_in, write_json
+from leco_plugin.stability import plan
 from leco_plugin.stability.cases import Case, cases_named
 from leco_plugin.stability.photographs import digest_of, write_scene
-from leco_plugin.stability.plan import (
-    FULL,
-    QUICK,
-    Entry,
-    Key,
-    Run,
-    Sampler,
-    Sizes,
-    core_seconds,
-    entries_of,
-    runs_of,
-    samplers_named,
-    scenes_of,
-)
+from leco_plugin.stability.plan import FULL, Entry, Key, Run, Sampler, Sizes
 from leco_plugin.stability.table import draw, draw_side_by_side, table
 from leco_plugin.stability.verdict import judge
 
@@ -86,13 +74,13 @@ def make_table(
     """
     if minutes is not None and not 0.0 < minutes < math.inf:
         raise InputError(f"a table is made in a positive number of minutes, not {minutes}")
-    chosen, compared = cases_named(tuple(cases)), samplers_named(tuple(samplers))
+    chosen, compared = cases_named(tuple(cases)), plan.samplers_named(tuple(samplers))
     named = {"cases": cases, "samplers": samplers, "seeds": seeds, "seeds-beside": seeds_beside}
     words = [word for name, given in named.items() if given for word in (f"--{name}", *given)]
     words = ["leco stability --out DIR", *words, *(["--quick"] if quick else [])]
     command = " ".join(map(str, words))  # without this machine's paths
     with alone_in(out, "table"):
-        sizes = QUICK if quick else FULL
+        sizes = plan.QUICK if quick else FULL
         suite = Suite(out, chosen, compared, seeds, sizes, command, seeds_beside)
         put(suite.estimate())
         with resumable(), bar(counted(len(chosen), "case")) as show:
@@ -127,7 +115,7 @@ class Suite:
         if not cases or not samplers or not seeds:
             raise ValueError("a table needs at least one case, one sampler and one seed")
         require_seeds([*seeds, *beside])
-        self.entries = entries_of(cases, samplers, seeds, sizes, beside)
+        self.entries = plan.entries_of(cases, samplers, seeds, sizes, beside)
         other_sizes = "a table of other sizes, with --quick or without:"
         take_folder(out / SIZES, asdict(sizes), other_sizes, DAMAGED)
         for name in (SCENES, RUNS, FAILURES):
@@ -141,7 +129,7 @@ class Suite:
         self.stop = threading.Event()
         # small tensors gain more by another run than by another thread
         self.workers = usable_cores() if self.machine["device"] == "cpu" else 1
-        scenes = scenes_of(cases, sizes)
+        scenes = plan.scenes_of(cases, sizes)
         self.digests = {name: digest_of(*scene) for name, scene in scenes.items()}
         self.data, self.folders = {}, {}
         machine = {key: fact for key, fact in self.machine.items() if key not in PER_PORTION}
@@ -175,16 +163,17 @@ class Suite:
     def missing(self) -> list[Run]:
         """Runs that are not stored: first those that were never tried, then those that failed."""
         stored, failures = self.stored(), self.failures()
-        runs = [run for run in runs_of(self.entries) if run.key not in stored]
+        runs = [run for run in plan.runs_of(self.entries) if run.key not in stored]
         return sorted(runs, key=lambda run: run.key in failures)
 
     def estimate(self) -> str:
-        """How long what is missing takes, in words."""
         todo, stored = self.missing(), list(self.stored().values())
         at_once = max(1, min(self.workers, len(todo)))
-        runs = counted(len(runs_of(self.entries)), "run")
+        runs = counted(len(plan.runs_of(self.entries)), "run")
         some = f"{len(todo)} of {runs} {by_number(len(todo), 'is', 'are')} to be made"
-        return f"{some}, {at_once} at a time: about {spell(core_seconds(todo, stored) / at_once)}"
+        return (
+            f"{some}, {at_once} at a time: about {spell(plan.core_seconds(todo, stored) / at_once)}"
+        )
 
     def make(self, say: Say, show: Callable[[float], None], seconds: float = math.inf) -> None:
         """Makes what is missing; whenever this is stopped, what was finished is kept.
@@ -197,7 +186,7 @@ class Suite:
         def is_in_time(run: Run) -> bool:
             if seconds == math.inf or run in todo[: self.workers]:
                 return True
-            expected = core_seconds([run], list(self.stored().values()))
+            expected = plan.core_seconds([run], list(self.stored().values()))
             return time.monotonic() + expected <= ends
 
         def note(line: str) -> None:
@@ -208,7 +197,7 @@ class Suite:
             folder.clear()
         self.write()
         threads: Any = {"stop": self.stop, "at_once": self.workers, "is_wanted": is_in_time}
-        done = len(runs_of(self.entries)) - len(todo)
+        done = len(plan.runs_of(self.entries)) - len(todo)
         make_jobs(todo, self._make_one, note, show, done=done, **threads)
 
     def _make_one(self, run: Run, show: Callable[[float], None]) -> str:
