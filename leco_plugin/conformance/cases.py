@@ -4,11 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from leco_plugin.conformance import (  # noqa: F401 (checks that are registered)
-    host_images,
-    host_training,
-    visibility,
-)
+from leco_plugin.conformance import host_images, host_training  # noqa: F401 (register checks)
 from leco_plugin.conformance.estimators import EstimatorCase
 from leco_plugin.conformance.hosts import HostCase
 from leco_plugin.conformance.proposals import ProposalCase

@@ -1,7 +1,7 @@
 """The rules that others rely on, each with its reason and remedy, and how one is applied.
 
-Checks are registered with `checks(RULE, SEAM)` where they are written: `estimators`, `visibility`,
-`proposals`, `samplers`, `host_images` and `host_training`. A check asks what its rule says.
+Checks are registered with `checks(RULE, SEAM)` where they are written: `estimators`, `proposals`,
+`samplers`, `host_images` and `host_training`. A check asks what its rule says.
 """
 
 from __future__ import annotations
