@@ -20,13 +20,8 @@ from leco_plugin.capacity.search import Candidate, find_threshold, gates, grids
 from leco_plugin.capacity.sources import Source, draw_held_out, draw_training_rays
 from leco_plugin.chart.runner import SETTINGS, make_jobs, take_folder
 from leco_plugin.chart.theme import DARK, LIGHT
+from leco_plugin.evaluation import equal_loss
 from leco_plugin.evaluation.clock import seconds_now
-from leco_plugin.evaluation.equal_loss import (
-    kept_shares,
-    mapped_box,
-    plain_and_dilated,
-    reached_volume,
-)
 from leco_plugin.evaluation.field_grids import fits_memory, largest_in_cells
 from leco_plugin.evaluation.inspection import ViewBox, in_parts
 from leco_plugin.evaluation.report import describe_code, describe_machine, made_by, read_object
@@ -116,7 +111,7 @@ def _render_rays(source: Source, model: LecoModel) -> Taught:
             "the field shows nothing along held-out rays, so that no loss can be measured: let one "
             "learn longer, with a larger --learn-steps and a new folder at --out"
         )
-    volume = reached_volume(mixture, lesson.mapped, VOLUME_POINTS, seed=5)
+    volume = equal_loss.reached_volume(mixture, lesson.mapped, VOLUME_POINTS, seed=5)
     mapped = mixture.region.space.map(evidence.positions).clamp(-1.0, 1.0)
     return Taught(mixture, lesson, evidence, mapped, volume)
 
@@ -137,7 +132,7 @@ def measure(evidence: Evidence, scores: Tensor, of_volume: Tensor, lost: float) 
         of_volume: [P] of places spread evenly over what rays reach of the scene's box.
         lost: share of the weight near surfaces.
     """
-    volume, candidates = kept_shares(evidence.worth, scores, of_volume, lost)
+    volume, candidates = equal_loss.kept_shares(evidence.worth, scores, of_volume, lost)
     losses = [lost_where(evidence.worth, scores, of_volume, share) for share in VOLUMES]
     return {"kept_volume": volume, "kept_candidates": candidates, "lost_at_volumes": losses}
 
@@ -189,12 +184,12 @@ def taught_score(
 def _measure_grid(taught: Taught, candidate: Candidate, lost: float) -> dict[str, Any]:
     """What a taught grid keeps and loses, dilated by a cell where it keeps less so."""
     assert candidate.resolution is not None
-    box = mapped_box(taught.mixture)
+    box = equal_loss.mapped_box(taught.mixture)
     scores = taught_grid(taught.lesson, box, candidate.resolution)
     places = taught.mapped, taught.volume, taught.held_out.worth
     both = [
         measure(taught.held_out, of_rays, of_volume, lost) | {"octree_bytes": size}
-        for of_rays, of_volume, size in plain_and_dilated(scores, box, *places, lost)
+        for of_rays, of_volume, size in equal_loss.plain_and_dilated(scores, box, *places, lost)
     ]
     return min(both, key=lambda one: one["kept_volume"])
 

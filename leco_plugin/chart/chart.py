@@ -12,17 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from leco_plugin.chart import page, picture
-from leco_plugin.chart.contender import (
-    LEARNED,
-    SMALL,
-    Contender,
-    Job,
-    Protocol,
-    forecast,
-    require_seeds,
-    settings_of,
-)
+from leco_plugin.chart import contender, page, picture
+from leco_plugin.chart.contender import Contender, Job, Protocol
 from leco_plugin.chart.runner import (
     DAMAGED,
     RESULTS,
@@ -80,7 +71,7 @@ class Chart:
     ) -> None:
         if not contenders or not seeds:
             raise ValueError("a chart needs at least one method and one seed")
-        require_seeds(seeds)
+        contender.require_seeds(seeds)
         self.data, self.scene, self.machine = data, describe_scene(data), describe_machine()
         self.held_out = describe_held_out(data, protocol.held_out)
         self.machine["threads"] = protocol.threads(self.machine["threads"])
@@ -89,7 +80,7 @@ class Chart:
         self.stop = threading.Event()
         self.contenders = list(contenders)
         self.jobs = jobs_of(contenders, seeds)
-        self.settings = settings_of(self.scene, protocol, self.suite, self.machine)
+        self.settings = contender.settings_of(self.scene, protocol, self.suite, self.machine)
         for source in reuse:
             if other := why_not_shared(source, self.settings):
                 raise InputError(f"--reuse {source}: {other}")
@@ -136,7 +127,7 @@ class Chart:
             return f"{title}: failed: {failure}"
         code = run.pop("code", None) or describe_code()
         self.folder.store(job, run, made={**self._made(), **code})
-        learns = job.contender.sampler.startswith(LEARNED)
+        learns = job.contender.sampler.startswith(contender.LEARNED)
         late = learns and run["freeze_seconds"] is None
         return (
             f"{title}: {run['psnr']:.2f} dB after {run['train_seconds']:.0f} s, "
@@ -145,8 +136,8 @@ class Chart:
 
     def forecast(self, todo: Sequence[Job]) -> str:
         """How many runs are to be made, and about how long that takes."""
-        megapixels = megapixels_of(self.data) or SMALL
-        about = forecast((job.contender for job in todo), self.protocol, megapixels)
+        megapixels = megapixels_of(self.data) or contender.SMALL
+        about = contender.forecast((job.contender for job in todo), self.protocol, megapixels)
         runs = f"{counted(len(todo), 'run')} of {self.protocol.describe()}"
         beside = f", {self.protocol.at_once} at a time" if self.protocol.at_once > 1 else ""
         stored = len(self.jobs) - len(todo)

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from leco_plugin.chart import summary
 from leco_plugin.chart.learned import learned_headline, learned_of, not_always_frozen
 from leco_plugin.chart.representations import (
     SPARSE,
@@ -14,38 +15,29 @@ from leco_plugin.chart.representations import (
     shortest_verdict,
     verdict,
 )
-from leco_plugin.chart.summary import (
-    COSTS,
-    LEARNING,
-    Cost,
-    Line,
-    front,
-    headline,
-    lines_of,
-    sentence,
-)
+from leco_plugin.chart.summary import Cost, Line
 
-HELD_COSTS = {"size": "size of the occupancy, kB", "learn_seconds": LEARNING.titled}
+HELD_COSTS = {"size": "size of the occupancy, kB", "learn_seconds": summary.LEARNING.titled}
 """Names in `Held` of what an occupancy costs, and their titles."""
 
 
 def finding_of(results: Mapping[str, Any], short: bool = False) -> str:
     """One sentence, without a full stop, about results that hold at least one run; a short one, for
     a title, has about ten words."""
-    lines = lines_of(results)
+    lines = summary.lines_of(results)
     if held := representations_of(lines):
         never = 0 if short else len(not_always_frozen(lines))
         said = shortest_verdict(held) if short else verdict(held)
-        return sentence(said) + (f"; {never} not always frozen" if never else "")
+        return summary.sentence(said) + (f"; {never} not always frozen" if never else "")
     if asks_what_was_learned(results):
-        return sentence(learned_headline(learned_of(lines), short))
-    return sentence(headline(results, short))
+        return summary.sentence(learned_headline(learned_of(lines), short))
+    return summary.sentence(summary.headline(results, short))
 
 
 def asks_what_was_learned(results: Mapping[str, Any]) -> bool:
     """Whether the chart compares what gates learn in equal steps, not where runs end."""
     by_steps = results["suite"] is not None and results["protocol"]["seconds"] is None
-    return by_steps and bool(learned_of(lines_of(results)))
+    return by_steps and bool(learned_of(summary.lines_of(results)))
 
 
 @dataclass(frozen=True)
@@ -79,7 +71,7 @@ class Panel:
         """The points that no other one beats in both, from the best x on."""
         places = [(one.x, one.y) for one in self.points]
         across, up = -1.0 if self.more_x else 1.0, -1.0 if self.less else 1.0
-        return [places[i] for i in front([(across * x, up * y) for x, y in places])]
+        return [places[i] for i in summary.front([(across * x, up * y) for x, y in places])]
 
 
 @dataclass(frozen=True)
@@ -94,13 +86,13 @@ class Shown:
 
 def shown_of(results: Mapping[str, Any]) -> Shown:
     """Of results that hold at least one run."""
-    lines = lines_of(results)
+    lines = summary.lines_of(results)
     space = []
     if held := representations_of(lines):
         space = [kept_panel(figure, held, lines) for figure in HELD_COSTS]
     elif asks_what_was_learned(results):
         space = [learned_panel(lines)]
-    return Shown(lines, [cost_panel(cost, lines) for cost in COSTS], space)
+    return Shown(lines, [cost_panel(cost, lines) for cost in summary.COSTS], space)
 
 
 def cost_panel(cost: Cost, lines: Sequence[Line]) -> Panel:

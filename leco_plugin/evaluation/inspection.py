@@ -13,13 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from leco_plugin.learning.quality import (
-    AT_END,
-    FIELD,
-    ONE_COLOUR,
-    doubts_of_field,
-    doubts_of_occupancy,
-)
+from leco_plugin.learning import quality
 from leco_plugin.models.region import cut_rays, marching_rule, within_crop
 from leco_plugin.occupancy import SEEN_CELLS, Occupancy
 from leco_plugin.samplers import marching
@@ -102,13 +96,13 @@ def doubts(facts: dict[str, Any]) -> list[str]:
     `facts` are of `describe`."""
     found: list[str] = []
     report = facts["report"]
-    at_end = report.get(AT_END)
+    at_end = report.get(quality.AT_END)
     figures = at_end if isinstance(at_end, dict) else report
-    field, one_colour = (figures.get(name) for name in (FIELD, ONE_COLOUR))
+    field, one_colour = (figures.get(name) for name in (quality.FIELD, quality.ONE_COLOUR))
     if isinstance(field, float) and isinstance(one_colour, float):
-        found = doubts_of_field(field, one_colour)
+        found = quality.doubts_of_field(field, one_colour)
     kept = facts["kept_share_of_box"] / max(facts["seen_share_of_box"], 1e-12)
-    return found or doubts_of_occupancy(kept)
+    return found or quality.doubts_of_occupancy(kept)
 
 
 def whole_box(occupancy: Occupancy) -> ViewBox:
