@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -34,31 +35,24 @@ Density = Callable[[Tensor], Tensor]
 """Of mapped positions [N, 3]: [N]."""
 
 
+@dataclass
 class FieldGrids:
-    """Grids of one field in a box of mapped coordinates, from coarse to fine.
+    """Grids of one field in a box of mapped coordinates, from coarse to fine."""
 
-    Args:
-        known: mapped positions [M, 3] and densities [M] that count too: hundreds of random places
-            miss a surface that fills a thousandth of a cell.
-        floor_of: gives, for the scores [n, n, n] of a grid, the score below which a cell and
-            its neighbours are empty in finer grids too.
-        most: densities that may be evaluated for one grid.
-    """
-
-    def __init__(
-        self,
-        density: Density,
-        box: ViewBox,
-        known: tuple[Tensor, Tensor] | None,
-        floor_of: Callable[[Tensor], float],
-        most: float = math.inf,
-    ) -> None:
-        self.density, self.box, self.known, self.floor_of = density, box, known, floor_of
-        self.most = most
-        self.scores: Tensor | None = None
-        self.floor = 0.0
-        self.clock = Clock()
-        """The time of the last grid, including those that it was refined from."""
+    density: Density
+    box: ViewBox
+    known: tuple[Tensor, Tensor] | None
+    """Mapped positions [M, 3] and densities [M] that count too: hundreds of random places miss a
+    surface that fills a thousandth of a cell."""
+    floor_of: Callable[[Tensor], float]
+    """For the scores [n, n, n] of a grid, the one below which a cell and its neighbours are empty
+    in finer grids too."""
+    most: float = math.inf
+    """Densities that may be evaluated for one grid."""
+    scores: Tensor | None = None
+    floor: float = 0.0
+    clock: Clock = field(default_factory=Clock)
+    """The time of the last grid, including those that it was refined from."""
 
     def fill(self, cells: int) -> Tensor | None:
         """Scores [n, n, n] of a grid with n = `cells` along each axis; None where it would ask more
