@@ -19,15 +19,7 @@ from nerfstudio.cameras.rays import RayBundle
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from leco_plugin.evaluation import inspection
-from leco_plugin.evaluation.field_grids import (
-    FieldGrids,
-    density_of,
-    dilate,
-    fits_memory,
-    look_up_scores,
-    octree_bytes,
-)
+from leco_plugin.evaluation import field_grids, inspection
 from leco_plugin.evaluation.inspection import ViewBox, ask, in_parts, whole_box
 from leco_plugin.evaluation.report import finite_or_null
 from leco_plugin.learning.calibration import CalibrationConfig
@@ -153,9 +145,11 @@ def plain_and_dilated(
     """A grid of scores [n, n, n] as it is, then dilated by a cell: its scores of candidates [M, 3]
     and of places `volume` [P, 3], and its octree's bytes where a share of the weights [M] is lost.
     """
-    for cells in (scores, dilate(scores)):
-        of_rays, of_volume = (look_up_scores(cells, box, places) for places in (mapped, volume))
-        yield of_rays, of_volume, octree_bytes(cells >= threshold_losing(weights, of_rays, lost))
+    for cells in (scores, field_grids.dilate(scores)):
+        of_rays = field_grids.look_up_scores(cells, box, mapped)
+        of_volume = field_grids.look_up_scores(cells, box, volume)
+        kept = cells >= threshold_losing(weights, of_rays, lost)
+        yield of_rays, of_volume, field_grids.octree_bytes(kept)
 
 
 def _kept_by_grid(
@@ -185,14 +179,14 @@ def _kept_by_grids(
     rows, left_out, box = [], [], mapped_box(mixture)
 
     def floor_of(scores: Tensor) -> float:
-        of_rays = look_up_scores(scores, box, mapped)
+        of_rays = field_grids.look_up_scores(scores, box, mapped)
         return threshold_losing(weights, of_rays, SPARED * LOST_SURFACE_MASS)
 
     most = MOST_ON_CPU if mixture.device.type == "cpu" else math.inf
-    known = taught, density_of(mixture, taught)
-    filling = FieldGrids(partial(density_of, mixture), box, known, floor_of, most)
+    density = partial(field_grids.density_of, mixture)
+    filling = field_grids.FieldGrids(density, box, (taught, density(taught)), floor_of, most)
     for n in resolutions:
-        scores = filling.fill(n) if fits_memory(n**3) else None
+        scores = filling.fill(n) if field_grids.fits_memory(n**3) else None
         if scores is None:
             left_out.append(n)
             continue
