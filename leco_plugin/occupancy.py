@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from leco_plugin.models.frozen_gate import occupancy_of
 from leco_plugin.models.gate import Gate, GateConfig, check_sizes
+from leco_plugin.on_cpu import on_cpu
 from leco_plugin.samplers.boxes import check_positions
 from leco_plugin.samplers.kernels import fused
 from leco_plugin.scenes.input_error import first_line
@@ -93,7 +94,7 @@ class Occupancy(nn.Module):
     @property
     def threshold(self) -> float:
         """tau: positions with o(x) >= tau are kept."""
-        return float(self.threshold_value)
+        return float(on_cpu(self.threshold_value))
 
     def with_threshold(self, threshold: float, report: dict[str, Any] | None = None) -> Occupancy:
         """An occupancy with another threshold that shares everything else.

@@ -11,6 +11,8 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from leco_plugin.on_cpu import on_cpu
+
 SpaceKind = Literal["box", "contraction"]
 
 NO_WALL = 1e6
@@ -72,7 +74,7 @@ class Space(nn.Module):
 
     @property
     def kind(self) -> SpaceKind:
-        return "contraction" if bool(self.unbounded) else "box"
+        return "contraction" if on_cpu(self.unbounded) else "box"
 
     def set(self, kind: SpaceKind, center: Tensor, half_extent: float) -> None:
         """Redefines the mapping in place. ValueError if the half extent is not a positive finite
@@ -92,11 +94,9 @@ class Space(nn.Module):
         visible.
         """
         scaled = (positions - self.center) / self.half_extent
-        if scaled.device.type == "cpu" and not self.unbounded:  # elsewhere to ask is to wait
-            return scaled
-        return torch.where(self.unbounded, contract(scaled) * 0.5, scaled)
+        return scaled if self.kind == "box" else contract(scaled) * 0.5
 
     def unmap(self, mapped: Tensor) -> Tensor:
         """Inverse of `map`: mapped positions [..., 3] to scene positions [..., 3]."""
-        scaled = torch.where(self.unbounded, uncontract(mapped * 2.0), mapped)
+        scaled = mapped if self.kind == "box" else uncontract(mapped * 2.0)
         return scaled * self.half_extent + self.center

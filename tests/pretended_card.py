@@ -1,11 +1,13 @@
 """A card that any machine has: its tensors say `card:0`, hold their numbers on the CPU, and refuse,
 as those of a GPU do, to meet tensors or random numbers of another device.
 
-It has none of CUDA's operations: what is chosen for `cuda` alone is not tried.
+It has none of CUDA's operations: what is chosen for `cuda` alone is not tried. Who would wait for a
+GPU is noted in `waits`.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -25,6 +27,16 @@ COPIES = {aten._to_copy.default, aten.copy_.default}
 """What may have tensors of two devices."""
 INDEXING = {aten.index.Tensor, aten.index_put_.default, aten._index_put_impl_.default}
 """What takes indices of the CPU, whatever it indexes."""
+READING = {
+    *(aten._local_scalar_dense.default, aten.equal.default, aten.nonzero.default),
+    *(aten.masked_select.default, aten.bincount.default, aten.repeat_interleave.Tensor),
+    *(aten._unique2.default, aten.unique_dim.default, aten.unique_consecutive.default),
+}
+"""What asks a GPU for a number, or for the size of what it gives."""
+waits: list[str] = []
+"""Where the CPU waited to read from the card: module and function of this package or of nerfstudio,
+whichever is nearer. What is copied to the card is not counted, though from pageable memory a GPU
+waits for that too."""
 
 
 class OnCard(Tensor):
@@ -63,6 +75,7 @@ class OnCard(Tensor):
         return self.held.__reduce_ex__(protocol)  # as what is loaded to the CPU
 
     def tolist(self) -> Any:
+        _note_wait()
         return self.held.tolist()
 
     def numpy(self, *, force: bool = False) -> Any:
@@ -90,6 +103,8 @@ def _answer(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     if mixed and function not in COPIES:
         shapes = [[tuple(one.shape) for one in some] for some in (on_card, elsewhere)]
         raise RuntimeError(f"{function}: {shapes[0]} are on the card and {shapes[1]} are not")
+    if on_card and _reads(function, args, kwargs):
+        _note_wait()
     generators = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, _Generator)]
     if any((one._cdata in _of_card) != gives for one in generators):
         raise RuntimeError(f"{function}: a generator of another device than the tensor's")
@@ -112,6 +127,30 @@ def _answer(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         return OnCard(value) if gives else value
 
     return tree_map(placed, out)
+
+
+def _reads(function: Any, args: Any, kwargs: dict[str, Any]) -> bool:
+    """Whether an operation on tensors of the card makes the CPU wait for it."""
+    if function in READING:
+        return kwargs.get("output_size") is None
+    if function in INDEXING:
+        masks = [one for one in args[1] if one is not None and one.dtype == torch.bool]
+        one_value = function is not aten.index.Tensor and args[2].numel() == 1
+        return bool(masks) and not one_value
+    if function is aten.copy_.default:
+        return not isinstance(args[0], OnCard)
+    asked = kwargs.get("device")
+    return function in COPIES and asked is not None and not _is_card(asked)
+
+
+def _note_wait() -> None:
+    frame: Any = sys._getframe()
+    while frame is not None:
+        module = frame.f_globals.get("__name__", "")
+        if module.split(".")[0] in ("leco_plugin", "nerfstudio"):
+            waits.append(f"{module}.{frame.f_code.co_name}")
+            return
+        frame = frame.f_back
 
 
 class _Mode(TorchDispatchMode):

@@ -1,4 +1,4 @@
-"""python training_on_a_card.py refusals | sampling, or leco-occupancy | hosts and a folder."""
+"""python training_on_a_card.py refusals | sampling | reading, or leco-occupancy | hosts FOLDER."""
 
 from __future__ import annotations
 
@@ -13,15 +13,19 @@ import pytest
 import tiny_scene
 import torch
 import tyro
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.registry import discover_methods
-from pretended_card import CARD, pretended_card
+from pretended_card import CARD, pretended_card, waits
 from small_hosts import NERFACTO, NGP, QUICK, RAYS, SWITCH_NERF, sizes
 from tiny_run import tiny_config
 
 from leco_plugin.conformance.scene import SLAB, crossing
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig
+from leco_plugin.models.mixture import Mixture
+from leco_plugin.models.rendering import Routing
+from leco_plugin.models.sizing.sizes import Sizes
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 
 HOSTS = {
@@ -76,6 +80,54 @@ def sampling() -> None:
     print("same" if gate.to(CARD).occupied(positions).device == positions.device else "elsewhere")
 
 
+def reading() -> None:
+    """What the CPU knows of a mixture on the card, however it was written."""
+    sizes = Sizes(candidates=8, gate=GateConfig(EncodingConfig(octaves=2), width=8, layers=1))
+    here = Mixture(sizes, 1, "float32", Routing(None, False))
+    mixture = copy.deepcopy(here).to(CARD)
+
+    def known(of: Mixture) -> tuple[bool, bool, list[float]]:
+        return of.is_frozen, of.skips, [*of.rule(), *of.rule(coarse=True)]
+
+    def claim(change: Callable[[Mixture], Any]) -> None:
+        for one in (here, mixture):
+            change(one)
+        read = known(mixture)
+        waits.clear()
+        assert known(mixture) == read == known(here) and not waits
+        print("known")
+
+    claim(lambda of: of.freeze(0.25, {}))
+    claim(lambda of: of.threshold.zero_())
+    claim(lambda of: of.steps.__setitem__(1, 0.5))
+    before, other = copy.deepcopy(here.state_dict()), copy.deepcopy(mixture)
+    claim(lambda of: of.reopen())
+    assert other.is_frozen and not other.to("cpu").skips
+    claim(lambda of: of.load_state_dict(before))
+    with torch.inference_mode():
+        claim(lambda of: of.cones.fill_(0.125))
+
+
+def waits_by_step(trainer: Any) -> dict[int, list[str]]:
+    """Where each step that a trainer takes from now on waits for the card, in this package."""
+    found: dict[int, list[str]] = {}
+
+    def end(step: int) -> None:
+        found[step] = [where for where in waits if where.startswith("leco_plugin")]
+
+    at = TrainingCallbackLocation
+    begin = TrainingCallback([at.BEFORE_TRAIN_ITERATION], lambda step: waits.clear())
+    trainer.callbacks.insert(0, begin)
+    trainer.callbacks.append(TrainingCallback([at.AFTER_TRAIN_ITERATION], end))
+    return found
+
+
+def say_waits(name: str, found: list[list[str]]) -> None:
+    """Those of the step with the fewest: others save, or measure, too."""
+    fewest = min(found, key=len)
+    print(f"{name} waits {len(fewest)} times a step:", *sorted(fewest))
+
+
 def trainer_of(config: Any, scene: Path) -> Any:
     """A trainer on the card, set up."""
     config.data = config.pipeline.datamanager.data = scene
@@ -115,7 +167,10 @@ def leco_occupancy(folder: Path) -> None:
         return config
 
     trainer = trainer_of(configured(steps_per_save=20), scene)
+    found = waits_by_step(trainer)
     trainer.train()
+    say_waits("leco-occupancy, learning,", [found[step] for step in range(5, 9)])
+    say_waits("leco-occupancy, guided,", [found[step] for step in range(15, 26)])
     assert trainer.pipeline.model.progress.sharpened_at > 0, "it was not sharpened"
     saved = trainer.checkpoint_dir
     resumed = trainer_of(configured(load_dir=saved, timestamp="resumed"), scene)
@@ -135,7 +190,9 @@ def guided(name: str, scene: Path, runs: Path) -> None:
     )
     config.output_dir = runs
     trainer = trainer_of(config, scene)
+    found = waits_by_step(trainer)
     trainer.train()
+    say_waits(name, [found[step] for step in range(5, 12)])
     render(trainer)
     print(f"{name} guided and rendered on {CARD}")
 
@@ -145,7 +202,7 @@ def main() -> None:
     what, *folder = sys.argv[1:]
     with pretended_card():
         if not folder:
-            {"refusals": refusals, "sampling": sampling}[what]()
+            {"refusals": refusals, "sampling": sampling, "reading": reading}[what]()
         elif what == "leco-occupancy":
             leco_occupancy(Path(folder[0]))
         else:

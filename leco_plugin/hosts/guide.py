@@ -22,6 +22,7 @@ from leco_plugin.learning.run import WatchState
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.region import FARTHEST, SIDE, Region, SeenBackdrops
 from leco_plugin.occupancy import SHOWN, Occupancy
+from leco_plugin.on_cpu import on_cpu
 from leco_plugin.samplers.registry import (
     OURS,
     SamplerSpec,
@@ -134,7 +135,7 @@ class Guide(nn.Module):
 
     def same_frame(self) -> bool:
         """Whether host and occupancy share their coordinates."""
-        return torch.equal(self.frame, torch.eye(3, 4, device=self.frame.device))
+        return torch.equal(on_cpu(self.frame), torch.eye(3, 4))
 
     def look(self, cameras: Cameras) -> None:
         """Notes the backdrops that these training cameras see."""

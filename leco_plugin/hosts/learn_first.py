@@ -107,7 +107,7 @@ def _with_psnr(model: LecoModel, manager: Any, show: Show) -> Callable[[float], 
     psnr = HeldOutPsnr(model, manager)
 
     def look(share: float) -> None:
-        if not bool(model.mixture.frozen):  # of a frozen gate a sampler would have to be built
+        if not model.mixture.is_frozen:  # of a frozen gate a sampler would have to be built
             psnr.look()
         show(share, psnr.words())
 
@@ -161,7 +161,7 @@ def _train(
     progress, manager = learner.progress, learner.data.manager
     started = seconds_now()
     step, timed_from = 0, started
-    while not bool(model.mixture.frozen):
+    while not model.mixture.is_frozen:
         model.plan = learner.before_step(step)
         began = seconds_now()
         bundle, batch = manager.next_train(step)

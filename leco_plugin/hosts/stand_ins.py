@@ -94,8 +94,9 @@ def _ending_in_a_backdrop(
     )
     usable = usable_rays(torch.stack([rays_o.t(), rays_d.t()]), rays.t_mins, rays.t_maxs)
     kept = usable[ended.ray_indices] | (ended.t_ends < rays.t_maxs[ended.ray_indices])
-    kept &= ended.t_ends > ended.t_starts
-    return ended.ray_indices[kept], ended.t_starts[kept], ended.t_ends[kept]
+    chosen = (kept & (ended.t_ends > ended.t_starts)).nonzero()[:, 0]
+    ray_indices, t_starts, t_ends = (part.index_select(0, chosen) for part in ended)
+    return ray_indices, t_starts, t_ends
 
 
 class GuidedEstimator(_StandIn):

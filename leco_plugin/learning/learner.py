@@ -102,7 +102,7 @@ class Learner:
                     f"{progress.since + most}, not for the {configured} steps of "
                     "schedule.learn-steps"
                 )
-        if not bool(mixture.frozen):  # else other steps would take it back into the first phase
+        if not mixture.is_frozen:  # else other steps would take it back into the first phase
             progress.begin(configured, most)
         mixture.routing = self.recoveries.routing()
         if not bool(mixture.region.known):
@@ -120,7 +120,7 @@ class Learner:
         self.history = GateHistory.load_before(resumed, self.run.start, self.mixture.gate)
         if len(self.history):
             self.history.leave(folder)
-        if bool(self.mixture.frozen):
+        if self.mixture.is_frozen:
             self._leave_file()
             carry_over(resumed, folder)
 
@@ -132,7 +132,7 @@ class Learner:
     def before_step(self, step: int) -> StepPlan:
         """Prepares the batch, and says how the step samples and what it teaches. Both follow from
         what checkpoints hold: a resumed run is where it was."""
-        config, progress, frozen = self.config, self.progress, bool(self.mixture.frozen)
+        config, progress, frozen = self.config, self.progress, self.mixture.is_frozen
         never_frozen = config.homogeneous or not config.schedule.freeze
         self.past_learning = never_frozen and step >= progress.learn_steps
         keep_pace(self.run.optimizers(), progress.pace)
@@ -174,14 +174,14 @@ class Learner:
         """
         if self.past_learning or self.config.homogeneous:
             return
-        if bool(self.mixture.frozen):
+        if self.mixture.is_frozen:
             self._watch(step, seconds, kept)
             if self._is_time_to_sharpen(step):
                 self._sharpen(step)
         else:
             self.progress.learn_seconds += seconds
             self._after_learning_step(step)
-        ends_unfrozen = step + 1 >= self.run.end and not bool(self.mixture.frozen)
+        ends_unfrozen = step + 1 >= self.run.end and not self.mixture.is_frozen
         if self.config.schedule.freeze and ends_unfrozen:
             say(
                 f"step {step}: the run ends while its occupancy is still learned, to step "
@@ -281,7 +281,7 @@ class Learner:
         """Whether so much of the run is over, and the field was guided for long enough by then,
         since freezing or the last time."""
         mixture, config, when = self.mixture, self.config.sharpening, SHARPENED_FROM * self.run.end
-        if config.steps == 0 or step + 1 < when or not bool(mixture.frozen):
+        if config.steps == 0 or step + 1 < when or not mixture.is_frozen:
             return False
         last = self.progress.sharpened_at
         enough = when - max(last, mixture.report["step"]) >= config.least_steps

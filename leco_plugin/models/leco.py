@@ -116,7 +116,7 @@ class LecoModel(DrawnInViewer, Model):
 
     def leco_drawn(self) -> Drawn | None:
         """See `DrawnInViewer`."""
-        return Drawn(self.mixture.occupancy(), None) if bool(self.mixture.frozen) else None
+        return Drawn(self.mixture.occupancy(), None) if self.mixture.is_frozen else None
 
     def rays_of(self, bundle: RayBundle) -> Rays:
         """The bundle's rays, cut to the region and to a crop; see `Region.rays`. In the viewer they
@@ -161,7 +161,7 @@ class LecoModel(DrawnInViewer, Model):
             self.kept_per_ray = kept if mixture.skips else 1.0
             shaded = mixture.shade(rays, intervals)
             likely = max(KEPT_ABOVE, self.config.likely_above)
-            above = 0.0 if bool(mixture.frozen) else likely  # a frozen gate has left out the others
+            above = 0.0 if mixture.is_frozen else likely  # a frozen gate has left out the others
             return {
                 "rgb": shaded.rgb,
                 "depth": shaded.depth[:, None],
@@ -202,7 +202,7 @@ class LecoModel(DrawnInViewer, Model):
             learning=plan.coarse,
             ramped=plan.ramped,
         )
-        if plan.gate_loss is not None and not bool(self.mixture.frozen):
+        if plan.gate_loss is not None and not self.mixture.is_frozen:
             unit, equal = region.space.half_extent, config.homogeneous
             losses |= gate_losses(plan.gate_loss, *batch_of, unit, equal, ramped=plan.ramped)
         require_finite(losses, self, outputs, image)

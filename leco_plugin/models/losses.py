@@ -21,7 +21,8 @@ from leco_plugin.samplers.packed import exclusive_sum
 
 def expert_shares(routes: Tensor, num_experts: int) -> Tensor:
     """f_i: the share of points sent to each expert; routes [N] int64 to [num_experts] float32."""
-    return torch.bincount(routes, minlength=num_experts).float() / max(len(routes), 1)
+    counts = routes.new_zeros(num_experts)  # `bincount` would wait for a GPU
+    return counts.scatter_add_(0, routes, torch.ones_like(routes)).float() / max(len(routes), 1)
 
 
 def expert_statistics(routes: Tensor, sigmas: Tensor, num_experts: int) -> tuple[Tensor, Tensor]:

@@ -30,6 +30,7 @@ from leco_plugin.models.rendering import (
 )
 from leco_plugin.models.sizing.sizes import SIZES, Sizes, check, from_stored, to_store
 from leco_plugin.occupancy import SHOWN, Occupancy, Precision, gate_precision
+from leco_plugin.on_cpu import on_cpu
 from leco_plugin.samplers import marching
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.scenes.bounds import SceneBounds
@@ -105,10 +106,15 @@ class Mixture(nn.Module):
         return self.frozen.device
 
     @property
+    def is_frozen(self) -> bool:
+        """`frozen`, asked without waiting for the device."""
+        return bool(on_cpu(self.frozen))
+
+    @property
     def skips(self) -> bool:
         """Whether a frozen gate leaves out any candidate."""
         shown = SHOWN.get()
-        return bool(self.frozen) and (float(self.threshold) if shown is None else shown) > 0.0
+        return self.is_frozen and float(on_cpu(self.threshold) if shown is None else shown) > 0.0
 
     @torch.no_grad()
     def occupancies(self, mapped: Tensor, gate: Gate | None = None) -> Tensor:
@@ -126,7 +132,8 @@ class Mixture(nn.Module):
 
     def rule(self, coarse: bool = False) -> marching.March:
         """By which candidates follow one another: finely in renderings, coarsely while learning."""
-        return marching.March(float(self.steps[int(coarse)]), float(self.cones[int(coarse)]))
+        step, cone = (float(on_cpu(each)[int(coarse)]) for each in (self.steps, self.cones))
+        return marching.March(step, cone)
 
     def rays(
         self,
@@ -183,7 +190,7 @@ class Mixture(nn.Module):
     def shade(self, rays: Rays, intervals: Intervals) -> Shaded:
         """Renders intervals; no gradient reaches a frozen gate."""
         with gate_precision(self.device.type, self.precision):
-            return shade(self.scene(), rays, intervals, freeze_gate=bool(self.frozen))
+            return shade(self.scene(), rays, intervals, freeze_gate=self.is_frozen)
 
     @torch.no_grad()
     def weigh(self, rays: Rays, intervals: Intervals) -> Tensor:
@@ -313,7 +320,7 @@ class Mixture(nn.Module):
             require_keys(state, (SIZES, "precision", "routing", "report", "small"))
             self.precision, self.report = state["precision"], dict(state["report"])
             self.routing = Routing(**state["routing"])
-        self.gate.requires_grad_(not bool(self.frozen))
+        self.gate.requires_grad_(not self.is_frozen)
         if self.small is not None:
             self.small.requires_grad_(False)
         self._estimator = ()

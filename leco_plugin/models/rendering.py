@@ -160,9 +160,8 @@ def with_backdrop(
     ray_indices, t_starts, t_ends = (part.index_select(0, inside) for part in intervals)
     # every ray gets one more sample, so a sample moves back by the number of rays before it
     slots = torch.arange(len(inside), device=inside.device) + ray_indices
-    counts = torch.bincount(ray_indices, minlength=num_rays)
     numbers = torch.arange(num_rays, device=inside.device)
-    last_slots = counts.cumsum(0) + numbers
+    last_slots = torch.searchsorted(ray_indices, numbers, right=True) + numbers
     merged = []
     pairs = (ray_indices, numbers), (t_starts, starts), (t_ends, rays.t_maxs)
     for of_samples, of_rays in pairs:

@@ -33,6 +33,7 @@ from leco_plugin.models.switch.field import (
 )
 from leco_plugin.models.switch.rendering import coarse_and_fine, switch_losses, switch_statistics
 from leco_plugin.occupancy import gate_precision
+from leco_plugin.on_cpu import on_cpu
 from leco_plugin.samplers.base import densities_of_samples
 from leco_plugin.samplers.grid import OccupancyGridEstimator
 from leco_plugin.scenes.bounds import SceneBounds
@@ -191,7 +192,8 @@ class SwitchNerfModel(Model):
 
     def _shade(self, rays: Rays) -> tuple[Intervals, Shaded]:
         """Samples along rays in whichever way, shaded."""
-        region, step, cone_angle = self.region, float(self.step), float(self.cone)
+        region = self.region
+        step, cone_angle = (float(on_cpu(number)) for number in (self.step, self.cone))
         if self.occupancy_grid is not None:
             estimator: Any = self.occupancy_grid
             densities = densities_of_samples(self.density_fn, rays.origins, rays.directions)

@@ -225,7 +225,7 @@ def prune(
         )
     hidden = trans < early_stop_eps
     if alpha_thre > 0.0:
-        threshold = alphas.new_tensor(alpha_thre)
+        threshold = alphas.new_full((), alpha_thre)
         if alpha_cap is not None:
             threshold = threshold.fmin(alpha_cap(alphas).to(threshold))
         hidden |= alphas < threshold

@@ -32,6 +32,7 @@ from leco_plugin.learning.quality import AT_END, FIELD, ONE_COLOUR
 from leco_plugin.log import Show, bar, counted, details_in, on_screen, say, say_all, spell
 from leco_plugin.models.compute.ranks import is_first
 from leco_plugin.occupancy import Occupancy
+from leco_plugin.on_cpu import on_cpu
 from leco_plugin.studio.commands import hide_warnings_of_no_use
 from leco_plugin.studio.run_folder import CONFIG
 
@@ -221,4 +222,4 @@ def _phase(trainer: Any) -> str:
     frozen = getattr(getattr(model, "mixture", None), "frozen", None)
     if frozen is None:
         return "guided" if hasattr(model, "leco_guide") else ""
-    return "guided" if bool(frozen) else "learning the occupancy"
+    return "guided" if bool(on_cpu(frozen)) else "learning the occupancy"

@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from leco_plugin.samplers.scan import pack_info
+
 SIZES_PER_OCTAVE = 16
 """Steady sizes between a power of two and the next: on average 3% of the rows are filling."""
 
@@ -77,8 +79,8 @@ class Places:
 
     def __init__(self, keys: Tensor, num_keys: int) -> None:
         device = keys.device
-        sources = keys.argsort(stable=True)
-        counts = torch.bincount(keys, minlength=num_keys).tolist()  # one synchronisation
+        ordered, sources = keys.sort(stable=True)
+        counts = pack_info(ordered, num_keys)[:, 1].tolist()  # one synchronisation
         self.sizes = [steady_size(count, device.type) for count in counts]
         numbers = torch.arange(len(keys), device=device)
         self.filling: list[slice] = []
@@ -161,9 +163,8 @@ def within_capacity(
     """
     capacity = int(capacity_factor * -(-len(routes) // num_experts))
     by_value = gate_values.argsort(descending=True, stable=True)
-    order = by_value.index_select(0, routes.index_select(0, by_value).argsort(stable=True))
-    counts = torch.bincount(routes, minlength=num_experts)
-    firsts = counts.cumsum(0) - counts
+    experts, order = routes.index_select(0, by_value).sort(stable=True)
+    order, firsts = by_value.index_select(0, order), pack_info(experts, num_experts)[:, 0]
     places = torch.arange(len(routes), device=routes.device)
-    within = places - firsts.index_select(0, routes.index_select(0, order)) < capacity
+    within = places - firsts.index_select(0, experts) < capacity
     return torch.empty_like(within).scatter_(0, order, within)

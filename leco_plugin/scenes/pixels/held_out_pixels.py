@@ -16,6 +16,7 @@ import torch
 from nerfstudio.data.pixel_samplers import PixelSampler
 from torch import Tensor
 
+from leco_plugin.on_cpu import on_cpu
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.pixels.stored_pictures import StoredPictures
 from leco_plugin.scenes.survey import chosen_cameras
@@ -197,7 +198,7 @@ class HeldOutPixelSampler(PixelSampler):
         pictures = image_batch["image"]
         if isinstance(pictures, StoredPictures):
             return self._sample_stored(pictures, image_batch.get("mask"))
-        self.numbers = torch.as_tensor(image_batch["image_idx"]).cpu()
+        self.numbers = on_cpu(torch.as_tensor(image_batch["image_idx"]))
         batch: dict[str, Any] = super().sample(image_batch)
         return batch
 

@@ -11,6 +11,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from torch import Tensor
 
+from leco_plugin.on_cpu import on_cpu
 from leco_plugin.scenes.bounds import FEWEST_POINTS
 from leco_plugin.scenes.lenses import bend
 from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler, Lattice, look_up
@@ -133,7 +134,7 @@ class KnownDistancePixelSampler(HeldOutPixelSampler):
         self, batch: dict[str, Any], images: dict[str, Any], sparse: SparsePixels
     ) -> None:
         """Puts pixels with known distances in place of the batch's first ones."""
-        numbers = torch.as_tensor(images["image_idx"]).cpu()
+        numbers = on_cpu(torch.as_tensor(images["image_idx"]))
         drawn = torch.randint(
             len(sparse.distances), (round(self.config.known_share * len(batch["indices"])),)
         )
