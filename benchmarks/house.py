@@ -18,7 +18,7 @@ from matplotlib.patches import Rectangle
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = "leco_plugin"
 OUT = ROOT / "docs" / "house.svg"
-GROUND = ("space", "occupancy", "log", "names")
+GROUND = ("space", "occupancy", "log", "names", "on_cpu")
 """Files beside the rooms that others stand on; the rest of them are commands and methods."""
 STYLE = {"svg.hashsalt": PACKAGE}
 """Makes the identifiers in the file the same in every drawing."""
