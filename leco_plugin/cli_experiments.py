@@ -41,8 +41,8 @@ def chart(
         suite: A named comparison instead of methods and samplers. Minutes that it takes on two CPU
             cores with three seeds, by their speed: representations 12 to 30, empty-expert 14 to 34,
             losses 9 to 22, freeze 13 to 16, enough-time 16 to 18, grid-resolution 19 to 21. Several
-            of them, or all, have a folder each in that of --out and share their runs: all take 64
-            to 112 minutes.
+            of them, or all, have a folder each in that of --out and share their runs: all take 67
+            to 117 minutes.
         seconds: Training time of each run. Methods need it or --steps; without either, runs of a
             suite end after 400 steps (4,000 on a GPU), or after 90 s (freeze) or 120 s where times
             are compared.

@@ -52,6 +52,8 @@ NO_GIFTS = {
 distances of sparse points."""
 SKIPPING_NOTHING = {"schedule.freeze": False, "front_to_back": True}
 """Never frozen; rendered front to back, as guided images are."""
+SEVERAL_EXPERTS = {"sizes.field.experts.scene_experts": 4, "sizes.gate.scene_experts": 4}
+"""Of what compares experts, however few the scene needs."""
 NEVER_FROZEN = Contender("LeCO, never frozen", "leco-occupancy", DENSE, SKIPPING_NOTHING)
 VARIANTS = {
     "leco-occupancy-never-frozen": NEVER_FROZEN,
@@ -62,7 +64,7 @@ VARIANTS = {
         "LeCO, equal experts, no gate",
         "leco-occupancy",
         DENSE,
-        SKIPPING_NOTHING | {"homogeneous": True},
+        SKIPPING_NOTHING | SEVERAL_EXPERTS | {"homogeneous": True},
     ),
 }
 """Methods for the chart only: `leco-occupancy` with its phases changed."""
@@ -305,7 +307,8 @@ def _leco(name: str, **changes: object) -> Contender:
 
 
 def _paper(name: str, **changes: object) -> Contender:
-    return _leco(name, gate_loss__form="paper", gate_loss__fall_back=False, **changes)
+    paper = {"gate_loss__form": "paper", "gate_loss__fall_back": False}
+    return _leco(name, **SEVERAL_EXPERTS, **paper, **changes)
 
 
 def _empty_mlp(layers: int) -> dict[str, object]:
@@ -321,6 +324,7 @@ def _switch(sampler: str) -> Contender:
 
 
 SCENE_SIZED = _empty_mlp(SCENE_LAYERS)
+NO_EMPTY_EXPERT = {"sizes.field.experts.empty_expert": "none"}
 
 SUITES = {
     "representations": Suite(
@@ -342,10 +346,10 @@ SUITES = {
     "empty-expert": Suite(
         "How small must the empty-space expert be, and what if there is none? (reviews 3 and 6)",
         (
-            _leco("identity (ours)"),
-            _leco("MLP of one layer", **_empty_mlp(1)),
-            _leco("as large as a scene expert", **SCENE_SIZED),
-            _leco("none: density is zero", sizes__field__experts__empty_expert="none"),
+            _leco("identity (ours)", **SEVERAL_EXPERTS),
+            _leco("MLP of one layer", **SEVERAL_EXPERTS, **_empty_mlp(1)),
+            _leco("as large as a scene expert", **SEVERAL_EXPERTS, **SCENE_SIZED),
+            _leco("none: density is zero", **SEVERAL_EXPERTS, **NO_EMPTY_EXPERT),
             _paper("imbalance loss alone, identity", gate_loss__density=0.0),
             _paper("imbalance loss alone, large", gate_loss__density=0.0, **SCENE_SIZED),
         ),
@@ -353,7 +357,7 @@ SUITES = {
     "losses": Suite(
         "What do the losses of the gate do?",
         (
-            _leco("contribution (ours)"),
+            _leco("contribution (ours)", **SEVERAL_EXPERTS),
             _paper("paper: imbalance and density"),
             _paper("paper without density loss", gate_loss__density=0.0),
             _paper(

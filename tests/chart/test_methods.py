@@ -168,7 +168,8 @@ def test_the_phases_of_learning_are_methods_of_the_chart() -> None:
     never, retrained, homogeneous = contenders(names)
     assert never.changes == {"schedule.freeze": False, "front_to_back": True}
     assert retrained.changes == {"schedule.restart": True}
-    assert homogeneous.changes == never.changes | {"homogeneous": True}
+    four = {"sizes.field.experts.scene_experts": 4, "sizes.gate.scene_experts": 4}
+    assert homogeneous.changes == never.changes | four | {"homogeneous": True}
     assert contenders(["leco-occupancy"], ["dense"]) == [never]
 
 

@@ -1,8 +1,8 @@
 """Sizes chosen from how much there is to see in a scene, before training: `leco-occupancy`'s own.
 
 The measure is the texel: the footprint of a pixel at the scene's distance. A scene twice as wide
-has four times as many, so it gets four times the experts and the table, up to the sizes of the
-device. A size set by hand is kept, and sizes that depend on it follow it.
+has four times as many, so it gets four times the table and, if it is large, the experts, up to the
+sizes of the device. A size set by hand is kept, and sizes that depend on it follow it.
 """
 
 from __future__ import annotations
@@ -16,9 +16,11 @@ import torch
 from leco_plugin.log import counted, summarize
 from leco_plugin.models.compute.device import memory_of
 from leco_plugin.models.sizing.sizes import (
+    MOST_LEFT_BEHIND,
     Sizes,
     check,
     check_memory,
+    learning_only,
     left_open,
     size_at,
     sizes_for,
@@ -39,8 +41,11 @@ from leco_plugin.scenes.survey import (
 ENTRIES_PER_TEXEL = 2.5
 """Entries of a level of the hash table for each texel of the surface: a layer of cells has two
 corners for each of its cells, and where it runs across the grid some more."""
-TEXELS_PER_EXPERT = 1 << 16
-"""Texels for each scene expert of the device's width; a scene of fewer gets a narrower one."""
+TEXELS_PER_EXPERT = 1 << 20
+"""Texels for each scene expert. With one, surveys and cities of up to 750,000 texels were learned
+better than with four, which exchange many of their points while they learn."""
+TEXELS_OF_A_WHOLE_EXPERT = 1 << 16
+"""Texels from which on a scene expert is as wide as the device's; for fewer it is narrower."""
 CELLS_PER_PERIOD = 32
 """Finest cells of the field along the shortest period that the gate knows: what is occupied is
 coarser than what is seen."""
@@ -115,9 +120,8 @@ def choose(
     Raises:
         ValueError: sizes that cannot be together, or do not fit the device. One line.
     """
-    if wanted.largest_table is not None:
-        table = min(wanted.largest_table, most.field.encoding.log2_table)
-        most = with_size(most, "field.encoding.log2_table", table)
+    if wanted.left_behind:
+        most = learning_only(most)
     sizes = _filled(wanted, most, detail)
     check(sizes)
     reason = f"entries a level, {ENTRIES_PER_TEXEL:g} for each texel"
@@ -153,8 +157,8 @@ def _filled(wanted: Sizes, most: Sizes, detail: SceneDetail | None) -> Sizes:
     wished = math.ceil(min(texels / TEXELS_PER_EXPERT, largest.scene_experts))
     chosen = _between(1, wished, largest.scene_experts)
     number = experts.scene_experts or gate.scene_experts or chosen
-    # where one expert is too many its values, which go with the square of its width, follow texels
-    units = largest.width * math.sqrt(min(1.0, texels / TEXELS_PER_EXPERT))
+    # below that the values of an expert, which go with the square of its width, follow texels
+    units = largest.width * math.sqrt(min(1.0, texels / TEXELS_OF_A_WHOLE_EXPERT))
     width = experts.width or _in_granules(units, GRANULE, largest.width)
     octaves = 1 + round(math.log2(max(1.0, finest / CELLS_PER_PERIOD)))
     octaves = gate.encoding.octaves or _between(FEWEST_OCTAVES, octaves, widest.encoding.octaves)
@@ -207,7 +211,7 @@ def explain(
 
     def row(name: str, at: str, reason: str, power: bool = False) -> str:
         by_hand, top, size = (size_at(each, at) for each in (wanted, most, sizes))
-        left_behind = power and wanted.largest_table is not None
+        left_behind = wanted.left_behind and at in MOST_LEFT_BEHIND
         where = "for a field that only learns an occupancy" if left_behind else "on this device"
         why = reason if size < top else f"the most {where}; {reason}"
         text = f"2^{size}" if power else str(size)
@@ -215,13 +219,14 @@ def explain(
 
     alike = "as many as the gate's, which are set by hand"
     an_expert = alike if wanted.gate.scene_experts else f"one for {TEXELS_PER_EXPERT:,} texels"
+    narrower = f"narrower below {TEXELS_OF_A_WHOLE_EXPERT:,} texels"
     a_period = f"a period of {CELLS_PER_PERIOD} finest cells"
     rows = (
         row("finest cells", "field.encoding.finest", "no larger than a texel"),
         row("levels", "field.encoding.levels", "up to the finest cells"),
         row("hash table", "field.encoding.log2_table", table_reason, power=True),
         row("scene experts", "field.experts.scene_experts", an_expert),
-        row("expert width", "field.experts.width", "narrower where one is too many"),
+        row("expert width", "field.experts.width", narrower),
         row("gate octaves", "gate.encoding.octaves", a_period),
         row("gate width", "gate.width", f"{UNITS_PER_FEATURE:g} units for each feature"),
     )

@@ -36,9 +36,9 @@ class Sizes:
     learning too, the batch grows until it shades as many as before."""
     candidates: int = 128
     """Candidates along a ray once the occupancy guides, and in every rendering."""
-    largest_table: int | None = None
-    """Binary logarithm of the entries of the largest hash table that is chosen; None is that of the
-    device."""
+    left_behind: bool = False
+    """Whether the field only learns an occupancy for a host. What is chosen is then small: tables
+    of 2^16 entries at most, and one scene expert."""
 
 
 SMALL = Sizes()
@@ -114,16 +114,21 @@ def automatic(sizes: Sizes) -> Sizes:
     return sizes
 
 
-FIRST_TABLE = 16
-"""Binary logarithm of a level's entries where the field only learns an occupancy for a host: in the
-few hundred steps that it is there, larger tables take time and give nothing."""
+MOST_LEFT_BEHIND = {
+    "field.encoding.log2_table": 16,
+    "field.experts.scene_experts": 1,
+    "gate.scene_experts": 1,
+}
+"""The most of each where the field only learns an occupancy for a host. In the few hundred steps
+that it is there, larger tables take time and give nothing, and several experts take time, and now
+and then exchange most of their points at once: the field is then worth nothing for some steps."""
 
 
 def learning_only(sizes: Sizes) -> Sizes:
     """The same for a field that is left behind when the occupancy is learned."""
-    table = "field.encoding.log2_table"
-    smaller: Sizes = with_size(sizes, table, min(size_at(sizes, table), FIRST_TABLE))
-    return replace(smaller, largest_table=FIRST_TABLE)
+    for path, most in MOST_LEFT_BEHIND.items():
+        sizes = with_size(sizes, path, min(size_at(sizes, path), most))
+    return replace(sizes, left_behind=True)
 
 
 def left_open(sizes: Sizes) -> list[str]:
@@ -151,7 +156,7 @@ def from_stored(values: dict[str, Any], sizes: Sizes) -> tuple[Sizes, int]:
         field["encoding"] = EncodingConfig(**field["encoding"])
         field["experts"] = HMoEConfig(**field["experts"])
         gate = GateConfig.from_dict(values["gate"])
-        marched = {name: int(values[name]) for name in MARCHED}
+        marched: dict[str, Any] = {name: int(values[name]) for name in MARCHED}
         found = replace(sizes, gate=gate, field=FieldConfig(**field), **marched)
         return found, int(values["images"])
     except (KeyError, TypeError) as error:

@@ -16,8 +16,8 @@ from leco_plugin.models.sizing.sizes import (
     AUTOMATIC,
     BYTES_PER_VALUE,
     CHOSEN,
-    FIRST_TABLE,
     LARGE,
+    MOST_LEFT_BEHIND,
     PAPER,
     SMALL,
     Sizes,
@@ -137,14 +137,27 @@ def test_experts_that_follow_the_gate_do_not_claim_to_follow_texels() -> None:
 def test_a_field_that_is_left_behind_has_a_smaller_table_and_never_a_larger_one() -> None:
     few, many = scene(5e3, 4000.0), scene(1e7, 4000.0)
     first, alone = learning_only(automatic(SMALL)), automatic(SMALL)
-    for seen, table in ((few, size_at(chosen(SMALL, few), TABLE)), (many, FIRST_TABLE)):
+    most = MOST_LEFT_BEHIND[TABLE]
+    for seen, table in ((few, size_at(chosen(SMALL, few), TABLE)), (many, most)):
         assert size_at(choose(first, SMALL, seen, IMAGES).sizes, TABLE) == table
-    assert size_at(choose(alone, SMALL, many, IMAGES).sizes, TABLE) > FIRST_TABLE
-    (line,) = (x for x in choose(first, SMALL, many, IMAGES).lines if "hash table" in x)
-    assert "only learns an occupancy" in line and "by hand" not in line
-    assert size_at(learning_only(SMALL), TABLE) == FIRST_TABLE
+    assert size_at(choose(alone, SMALL, many, IMAGES).sizes, TABLE) > most
+    assert size_at(learning_only(SMALL), TABLE) == most
     small = with_size(SMALL, TABLE, 12)
     assert size_at(learning_only(small), TABLE) == 12
+
+
+@pytest.mark.parametrize("most", [SMALL, LARGE], ids=["SMALL", "LARGE"])
+def test_a_field_that_is_left_behind_has_one_scene_expert_unless_set_by_hand(most: Sizes) -> None:
+    many = scene(1e8, 4000.0)
+    made = choose(learning_only(automatic(most)), most, many, IMAGES)
+    assert made.sizes.gate.scene_experts == made.sizes.field.experts.scene_experts == 1
+    assert learning_only(most).gate.scene_experts == 1
+    told = [line for line in made.lines if "hash table" in line or "scene experts" in line]
+    assert len(told) == 2
+    for line in told:
+        assert "only learns an occupancy" in line and "by hand" not in line
+    by_hand = with_size(learning_only(automatic(most)), "field.experts.scene_experts", 3)
+    assert choose(by_hand, most, many, IMAGES).sizes.gate.scene_experts == 3
 
 
 def chosen_from(wanted: Sizes) -> Sizes:
@@ -267,14 +280,19 @@ def city(folder: Path, blocks: int) -> tuple[SceneDetail, int]:
 
 @pytest.mark.slow
 def test_a_block_has_a_quarter_of_the_parameters_of_eight_by_eight(tmp_path: Path) -> None:
-    values, tables = {}, []
+    values, tables, experts = {}, [], []
     for blocks in (1, 3, 8):
         found, images = city(tmp_path / str(blocks), blocks)
         sizes = choose(automatic(SMALL), SMALL, found, images).sizes
         values[blocks] = values_of(sizes, images)
         tables.append(size_at(sizes, TABLE))
+        experts.append(sizes.field.experts.scene_experts)
+        assert sizes.gate.scene_experts == experts[-1]
+        sizes = with_size(sizes, "field.experts.scene_experts", SMALL.field.experts.scene_experts)
+        sizes = with_size(sizes, "gate.scene_experts", SMALL.gate.scene_experts)
         assert sizes == SMALL or blocks < 8
     assert tables == [17, 19, 19]
+    assert experts == [1, 1, 1]
     assert values[1] <= values[8] / 4
 
 
