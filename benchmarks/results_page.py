@@ -117,7 +117,7 @@ To make a chart again, add `--out FOLDER` to its command. Its scenes:
 - `fox`: the 50 photographs of that name that come with NVIDIA's instant-ngp.
 
 *Never frozen* is the same model, whose gate goes on learning: it renders without skipping. *Equal
-experts, no gate* has as many scene experts, none for empty space, as Switch-NeRF, and never skips.
+experts, no gate* has four scene experts, none for empty space, as Switch-NeRF, and never skips.
 
 ## How to read a table
 

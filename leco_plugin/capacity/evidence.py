@@ -22,6 +22,7 @@ from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.rendering import Intervals, Rays, backdrop_of
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers import marching
+from leco_plugin.samplers.base import midpoints
 from leco_plugin.scenes.learning_data import on_black
 
 RAYS_AT_ONCE = 1024
@@ -98,18 +99,11 @@ def join(pieces: Sequence[Evidence]) -> Evidence:
     return Evidence._make([*map(torch.cat, tensors), before[-1]])
 
 
-def _middles(rays: Rays, intervals: Intervals) -> Tensor:
-    """Middles of packed intervals: [M, 3] scene units."""
-    ray_indices, t_starts, t_ends = intervals
-    along = 0.5 * (t_starts + t_ends)
-    return rays.origins[ray_indices] + rays.directions[ray_indices] * along[:, None]
-
-
 def _by_rendering(
     mixture: Mixture, occupancy: Occupancy | None, rays: Rays, truth: Tensor
 ) -> tuple[Evidence, Rendered]:
     intervals = mixture.with_backdrops(rays, mixture.candidates(rays))
-    positions = _middles(rays, intervals)
+    positions = midpoints(intervals, *rays[:2])
     is_backdrop = backdrop_of(intervals, rays)
     kept = ~is_backdrop
     if occupancy is not None:
@@ -131,7 +125,7 @@ def _by_decisions(occupancy: Occupancy, rays: Rays) -> Evidence:
     report = occupancy.report
     rule = marching.March(float(report["step_size"]), float(report.get("cone_angle", 0.0)))
     intervals = Intervals(*marching.march(marching.Rays(*rays[:4]), rule))
-    positions = _middles(rays, intervals)
+    positions = midpoints(intervals, *rays[:2])
     values = in_parts(occupancy.query, positions)
     kept = values >= occupancy.threshold_value
     worth = values * kept
@@ -179,7 +173,7 @@ def image_price(mixture: Mixture, rendered: Sequence[Rendered], smaller: Occupan
     """PSNR with what the original keeps minus that with what both keep, in dB."""
     before, after, pixels = 0.0, 0.0, 0
     for one in rendered:
-        both = smaller.occupied(_middles(one.rays, one.intervals)) | ~one.before_backdrop
+        both = smaller.occupied(midpoints(one.intervals, *one.rays[:2])) | ~one.before_backdrop
         rgb = mixture.shade(one.rays, Intervals(*(part[both] for part in one.intervals))).rgb
         before += float((one.rgb - one.truth).square().sum(dtype=torch.float64))
         after += float((rgb - one.truth).square().sum(dtype=torch.float64))

@@ -25,6 +25,7 @@ from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.frames import between, found_again, frame_of, moved, turned
 from leco_plugin.scenes.input_error import InputError, one_line, require_folder
 from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler, some_images
+from leco_plugin.scenes.pixels.known_distances import batches_of
 from leco_plugin.studio.checkpoints import step_of, whole_of
 
 CONFIG, CHECKPOINTS = "config.yml", "nerfstudio_models"
@@ -145,7 +146,7 @@ def draw_held_out(source: Source, occupancy: Occupancy, count: int, parts: int =
 
 
 def draw_training_rays(source: Source, occupancy: Occupancy, count: int) -> Seen:
-    bundle, batch = _next_batch(source, count)
+    bundle, batch = _draw(source, count)
     return _see(source, occupancy, bundle, batch["image"])
 
 
@@ -158,7 +159,7 @@ def draw_other_pixels(
     taken = np.concatenate([np.empty(0, np.int64), *known])
     pieces: list[tuple[Tensor, Tensor]] = []
     for _ in range(DRAWS):
-        batch = _next_batch(source, count)[1]
+        batch = _draw(source, count)[1]
         numbers = _numbers(batch["indices"])
         new = np.zeros(len(numbers), bool)
         new[np.unique(numbers, return_index=True)[1]] = True
@@ -225,13 +226,10 @@ def _frame_to(source: Source, occupancy: Occupancy) -> Tensor | None:
     return None if learned_in is None or here is None else between(here, learned_in)
 
 
-def _next_batch(source: Source, count: int) -> tuple[RayBundle, dict[str, Tensor]]:
+def _draw(source: Source, count: int) -> tuple[RayBundle, dict[str, Tensor]]:
     """`count` rays of random training pixels, and the pixels."""
-    sampler = source.manager.train_pixel_sampler
-    before = sampler.num_rays_per_batch
-    sampler.set_num_rays_per_batch(count)
-    bundle, batch = source.manager.next_train(0)
-    sampler.set_num_rays_per_batch(before)
+    with batches_of(count, source.manager):
+        bundle, batch = source.manager.next_train(0)
     return bundle, batch
 
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -21,7 +20,7 @@ from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.leco_config import FusedAdamConfig, LecoModelConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.pixels.known_distances import sampler_here
+from leco_plugin.scenes.pixels.known_distances import batches_of
 from leco_plugin.scenes.survey import CAMERAS
 
 FIRST_TIMED, TIMED_STEPS = 5, 15
@@ -91,7 +90,7 @@ def learn_model(
     run = LearningOnly(
         [FusedAdamConfig(lr=rate * RATES[name]).setup(p) for name, p in groups.items()]
     )
-    with _batches_of(rays, manager):
+    with batches_of(rays, manager):
         learner = model.learner(manager, run)
         learner.data.rays_per_batch = rays
         learner.begin()
@@ -112,21 +111,6 @@ def _with_psnr(model: LecoModel, manager: Any, show: Show) -> Callable[[float], 
         show(share, psnr.words())
 
     return look
-
-
-@contextmanager
-def _batches_of(rays: int, manager: Any) -> Iterator[None]:
-    """A data manager's batches have so many rays meanwhile, where it has them drawn here."""
-    sampler = sampler_here(manager)
-    if sampler is None:
-        yield
-        return
-    before = sampler.num_rays_per_batch
-    sampler.set_num_rays_per_batch(rays)
-    try:
-        yield
-    finally:
-        sampler.set_num_rays_per_batch(before)
 
 
 def check_budget(rays: int, seconds: float | None, rate: float) -> None:

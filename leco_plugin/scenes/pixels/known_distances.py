@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -115,6 +117,21 @@ def sampler_here(datamanager: Any) -> Any:
     if hasattr(datamanager, "data_procs"):
         return None
     return getattr(datamanager, "train_pixel_sampler", None)
+
+
+@contextmanager
+def batches_of(rays: int, manager: Any) -> Iterator[None]:
+    """A data manager's batches have so many rays meanwhile, where it has them drawn here."""
+    sampler = sampler_here(manager)
+    if sampler is None:
+        yield
+        return
+    before = sampler.num_rays_per_batch
+    sampler.set_num_rays_per_batch(rays)
+    try:
+        yield
+    finally:
+        sampler.set_num_rays_per_batch(before)
 
 
 class KnownDistancePixelSampler(HeldOutPixelSampler):
