@@ -12,7 +12,7 @@ import torch
 from small_learner import ARun, NoPixels, small_learner
 
 from leco_plugin.learning.dense import evaluating, near_median_depth
-from leco_plugin.learning.merging import Merging, MergingConfig, find_unneeded, line_of
+from leco_plugin.learning.merging import Merging, MergingConfig, Trial, find_unneeded, line_of
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.field import FieldConfig
 from leco_plugin.models.gate import GateConfig
@@ -191,6 +191,14 @@ def test_the_log_says_what_was_dropped_and_why_no_more(mixture: Mixture) -> None
     line = line_of(found, 4 - len(found.dropped))
     assert found.refused is not None
     assert f"without {found.refused.expert} (" in line and "would lose" in line
+
+
+def test_the_price_that_is_said_is_of_all_dropped_experts() -> None:
+    found = Merging([Trial(3, 0.02, 0.004), Trial(1, 0.05, 0.009)], None)
+    assert line_of(found, 2) == (
+        "scene experts: 2 left; dropped: 3 (2.0% of the surface mass) and 1 (5.0% of the surface "
+        "mass), for +0.009 dB; their points go to those left"
+    )
 
 
 def test_experts_that_the_gate_cannot_reach_leave_first() -> None:

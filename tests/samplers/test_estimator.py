@@ -186,6 +186,13 @@ def test_a_frozen_gate_is_not_updated_and_answers_like_a_grid(learned):
     assert agreement.float().mean() > 0.98
 
 
+def test_a_threshold_of_0_marks_every_cell():
+    balls = Balls(sharpness=1e4)
+    balls.threshold = 0.0
+    estimator = LearnedOccupancyEstimator(balls, cache_bytes=0)
+    assert float(estimator.occs.min()) == 0.0 and bool(estimator.binaries.all())
+
+
 def test_no_box_is_needed_and_one_may_be_given():
     balls = Balls("contraction")
     origins, directions = camera_rays(50)

@@ -96,6 +96,11 @@ def test_a_sample_in_the_light_whose_answer_is_nan_stays_and_changes_no_other_ra
     assert 0 < len(expected[0]) < len(samples[0])
 
 
+def test_opacities_that_are_nan_do_not_count_in_the_cap():
+    cap = DenseEstimator().alpha_cap(torch.tensor([0.2, torch.nan, 0.4]))
+    assert float(cap) == pytest.approx(0.03)
+
+
 def test_nothing_to_see_is_no_samples(scene):
     def never(*_):
         raise AssertionError("the field must not be asked about nothing")
