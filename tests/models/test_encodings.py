@@ -45,6 +45,11 @@ def hash_encoding() -> HashEncoding:
     return encoding.double()
 
 
+def test_resolutions_grow_evenly_from_the_coarsest_to_the_finest() -> None:
+    assert HashEncoding(4, 1, 4, 16, 128).resolutions.tolist() == [16, 32, 64, 128]
+    assert HashEncoding(1, 1, 4, 16, 128).resolutions.tolist() == [16]
+
+
 def test_frequencies_are_those_of_the_definition() -> None:
     x = (torch.rand(50, 3) * 2 - 1).double()
     encoding = build_encoding(EncodingConfig(octaves=5)).double()

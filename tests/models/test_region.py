@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from leco_plugin.models.region import Region, marching_rule
+from leco_plugin.models.region import Region, marching_rule, within_crop
 from leco_plugin.models.rendering import Rays
 from leco_plugin.samplers import marching
 from leco_plugin.samplers.marching import March, march
@@ -48,6 +48,13 @@ def test_rays_that_miss_get_a_piece_at_the_far_end() -> None:
     rays = rays_of(region_of(SLAB), torch.arange(3))
     torch.testing.assert_close(rays.t_mins, torch.tensor([1.0, 4.5, 4.5]))
     torch.testing.assert_close(rays.t_maxs, torch.tensor([3.0, 5.0, 5.0]))
+
+
+def test_a_crop_that_ends_no_ray_leaves_each_its_backdrop_or_none() -> None:
+    rays = rays_of(region_of(SLAB), torch.arange(3))
+    rays = rays._replace(cut_off=torch.tensor([True, False, True]))
+    cropped = within_crop(rays, torch.zeros(3), torch.full((3,), 9.0))
+    assert cropped.cut_off is not None and cropped.cut_off.tolist() == [True, False, True]
 
 
 def test_ground_beyond_far_is_reached_where_a_photograph_shows_it() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -70,6 +72,19 @@ def test_fine_samples_gather_where_coarse_ones_have_weight() -> None:
     intervals, _ = coarse_and_fine(ball, SPACE, rays, rays.t_maxs - 0.5, (32, 64), False, False)
     middles = 0.5 * (intervals.t_starts + intervals.t_ends)
     assert int(((middles > 2.8) & (middles < 3.5)).sum()) > 60
+
+
+def test_a_thin_fog_draws_fine_samples_from_all_of_a_ray() -> None:
+    """Its density is 1 per half extent, of which the ray crosses 0.65."""
+
+    def fog(mapped: Tensor) -> Answers:
+        return ball(mapped)._replace(sigmas=torch.ones(len(mapped)))
+
+    rays = some_rays(1)
+    intervals, _ = coarse_and_fine(fog, SPACE, rays, rays.t_maxs - 0.5, (64, 200), False, False)
+    middles = 0.5 * (intervals.t_starts + intervals.t_ends)
+    first_half = (1.0 - math.exp(-0.325)) / (1.0 - math.exp(-0.65))
+    assert abs(int((middles < 4.25).sum()) - (32 + 200 * first_half)) < 5
 
 
 def test_the_backdrop_gives_its_colour_and_is_nothing_met() -> None:
