@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -17,6 +18,7 @@ from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
 from leco_plugin.evaluation import metrics
 from leco_plugin.hosts.guided import Host, set_up_host
+from leco_plugin.studio import host_models
 from leco_plugin.studio.host_models import LazyLpipsNetwork, lazy_lpips
 
 
@@ -61,6 +63,19 @@ def test_a_host_without_lpips_weights_gives_metrics_that_are_json() -> None:
     assert not any("lpips" in name for name in figures)
     json.dumps(figures, allow_nan=False)
     assert "img" in pictures
+
+
+@pytest.mark.parametrize(("side", "distance"), [(31, 0.25), (30, math.nan)])
+def test_a_network_that_is_at_hand_is_asked_about_pictures_that_are_large_enough(
+    side: int, distance: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    metric = SimpleNamespace(
+        to=lambda device: metric, net=lambda first, _: torch.full((len(first), 1, 1, 1), 0.25)
+    )
+    monkeypatch.setattr(host_models, "lpips_metric", lambda backbone: metric)
+    pictures = torch.rand(2, 3, side, 50)
+    found = LazyLpipsNetwork()(pictures, pictures)
+    torch.testing.assert_close(found, torch.full((2, 1, 1, 1), distance), equal_nan=True)
 
 
 def test_a_metric_imported_before_is_lazy_too_and_eager_again_after() -> None:

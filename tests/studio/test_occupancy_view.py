@@ -23,7 +23,14 @@ from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.occupancy import SHOWN, Occupancy
 from leco_plugin.studio import occupancy_view
-from leco_plugin.studio.occupancy_view import COLOURS, NOT_YET, OccupancyView
+from leco_plugin.studio.occupancy_view import (
+    COLOURS,
+    NOT_YET,
+    STRENGTHS,
+    Drawn,
+    OccupancyView,
+    with_states,
+)
 from leco_plugin.studio.viewer import stop_drawing
 
 GATE = GateConfig(encoding=EncodingConfig(octaves=2), layers=1, width=8)
@@ -71,6 +78,16 @@ def test_the_slider_changes_what_is_drawn_only(host: Any, monkeypatch: pytest.Mo
     assert host(bundle)["samples"] == own and host.leco_guide.followed().threshold == 0.5
     host.leco_view.keep_from.value = 0.001
     assert draw(monkeypatch, host, bundle)["samples"] > own
+
+
+def test_the_slider_overrules_the_lower_threshold_that_a_host_begins_with(
+    host: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bundle = bundle_of(*rays())
+    host.leco_guide.watched.lower = 0.1
+    assert draw(monkeypatch, host, bundle)["samples"] > 0
+    host.leco_view.keep_from.value = 1.0
+    assert draw(monkeypatch, host, bundle)["samples"] == 0
 
 
 def test_leco_occupancy_is_drawn_at_the_sliders_threshold(
@@ -146,6 +163,17 @@ def test_the_overlay_colours_what_is_kept(host: Any, monkeypatch: pytest.MonkeyP
     skipped, kept, unseen = torch.nn.functional.normalize(torch.tensor(COLOURS), dim=-1)
     torch.testing.assert_close(drawn, torch.stack([kept, skipped, unseen]))
     assert not host(bundle)["rgb"].any()
+
+
+def test_a_crop_of_the_overlay_is_in_the_hosts_units() -> None:
+    """The host is half as large as the ball's coordinates: its rays meet the ball from 1.5 to 2.5,
+    which lies in the crop of the first one alone."""
+    origins = (torch.tensor(CENTRE) + torch.tensor([0.0, 0.0, 4.0])).expand(2, 3) / 2.0
+    bundle = bundle_of(origins, torch.tensor([[0.0, 0.0, -1.0]]).expand(2, 3))
+    bundle.nears, bundle.fars = torch.tensor([[0.0], [2.8]]), torch.tensor([[2.0], [9.0]])
+    drawn = with_states(torch.zeros(2, 3), Drawn(ball(), 2.0 * torch.eye(3, 4)), bundle)
+    (skipped, kept, _), strengths = torch.tensor(COLOURS), STRENGTHS
+    torch.testing.assert_close(drawn, torch.stack([strengths[1] * kept, strengths[0] * skipped]))
 
 
 def test_a_copy_has_controls_of_its_own(host: Any) -> None:
