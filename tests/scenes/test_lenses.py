@@ -10,7 +10,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from scene_files import refused
 
-from leco_plugin.scenes.lenses import UNDISTORTED, check_together, lens_of
+from leco_plugin.scenes.lenses import UNDISTORTED, check_together, lens_of, set_lenses
 from leco_plugin.scenes.scene_file import unused_fields
 
 SCENE: dict[str, Any] = {
@@ -38,12 +38,21 @@ def test_fields_of_view_are_focal_lengths() -> None:
     lens = lens_of(angles, {}, "here")
     assert lens.focal_lengths(40, 30, 1) == pytest.approx((20.0, 15.0))
     assert lens.focal_lengths(20, 15, 2) == pytest.approx((10.0, 7.5))
+    assert lens.focal_lengths(13, 10, 3) == pytest.approx((20 / 3, 5.0))  # 13 is rounded
     del angles["y_fov"]
     assert lens_of(angles, {}, "here").focal_lengths(40, 30, 1) == pytest.approx((20.0, 20.0))
     del angles["w"], angles["h"]  # the picture's own
     assert lens_of(angles, {}, "here").focal_lengths(50, 30, 1) == pytest.approx((25.0, 25.0))
     frame = {"camera_angle_x": 2 * math.atan(0.5)}  # goes before its scene, also by another name
     assert lens_of({"fl_x": 7.0}, frame, "here").focal_lengths(50, 30, 1) == pytest.approx((50, 50))
+
+
+def test_a_lens_without_a_principal_point_has_the_middle_of_its_picture() -> None:
+    sides = torch.full((1, 1), 20), torch.full((1, 1), 15)
+    cameras = Cameras(torch.eye(4)[None, :3], *torch.ones(4, 1, 1), *sides)
+    set_lenses(cameras, [lens_of({"w": 40, "h": 30, "fl_x": 30.0}, {}, "here")], 2)
+    found = [float(getattr(cameras, name)) for name in ("fx", "fy", "cx", "cy")]
+    assert found == [15.0, 15.0, 10.0, 7.5]
 
 
 def test_a_fisheye_of_instant_ngp_is_one() -> None:

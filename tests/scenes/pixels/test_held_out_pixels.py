@@ -52,6 +52,12 @@ def test_training_never_samples_a_held_out_pixel(masked: bool, options, lattice:
             assert bool(batch["mask"][tuple(places.unbind(dim=-1))].all())
 
 
+def test_a_held_out_pixel_at_the_right_edge_of_a_tall_picture_gives_way_to_the_left() -> None:
+    batch = {"image": torch.zeros(1, 60, 6, 3), "image_idx": torch.tensor([0])}
+    pixels = sampler().sample(batch)["indices"]
+    assert int(pixels[:, 2].max()) == 5 and not bool(THIN.holds_out(pixels).any())
+
+
 def test_training_reaches_every_other_pixel() -> None:
     torch.manual_seed(0)
     places = torch.cat([sampler().sample(images())["image"].long() for _ in range(20)]).unique(

@@ -149,6 +149,15 @@ def test_masked_pixels_are_left_out() -> None:
     assert 8 not in pixels["indices"][:, 0].tolist()
 
 
+def test_pictures_that_are_set_aside_teach_by_no_distance_either() -> None:
+    torch.manual_seed(0)
+    made = sampler()
+    made.sparse, made.set_aside = known(), torch.arange(10) == 8
+    pixels = made.sample(images())
+    assert int((pixels[DISTANCE] > 0).sum()) > 20
+    assert 8 not in pixels["indices"][:, 0].tolist()
+
+
 def of_many_sizes() -> dict[str, Any]:
     """The images 7 and 8; 7 is narrower."""
     pictures = [torch.zeros(20, 12, 3), torch.zeros(20, 30, 3)]
