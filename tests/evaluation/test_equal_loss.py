@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -144,6 +145,24 @@ def test_a_coarse_grid_keeps_a_thin_film(mixture: Mixture, monkeypatch: pytest.M
     )
     (row,) = at_equal_loss(mixture, None, grids=(8,))["grids"]
     assert row["kept_reached_volume"] < 0.2  # a slab of one cell, not the whole box
+
+
+def test_a_tenth_of_the_loss_may_lie_in_what_finer_grids_leave_out(
+    mixture: Mixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of four layers of cells the first three hold 5e-5, 5e-4 and the rest of the weight."""
+    floors = []
+
+    def grids(density: object, box: object, known: object, floor_of: Any, most: float) -> Any:
+        floors.append(floor_of(torch.arange(1.0, 5.0).repeat_interleave(16).view(4, 4, 4)))
+        return SimpleNamespace(fill=lambda cells: None)
+
+    places = torch.tensor([[-0.4, 0.0, 0.0], [-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]])
+    weights = torch.tensor([5e-5, 5e-4, 1.0])
+    monkeypatch.setattr(equal_loss, "_measured", lambda *_: (places, weights, torch.ones(3)))
+    monkeypatch.setattr(equal_loss, "FieldGrids", grids)
+    at_equal_loss(mixture, None, grids=(4,))
+    assert floors == [2.0]
 
 
 def test_unreached_space_is_not_counted(mixture: Mixture, monkeypatch: pytest.MonkeyPatch) -> None:
