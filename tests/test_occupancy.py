@@ -8,6 +8,7 @@ import random
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import torch
@@ -18,7 +19,7 @@ from torch import Tensor
 from leco_plugin import occupancy as occupancies
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import LARGEST_SIZES, Gate, GateConfig
-from leco_plugin.occupancy import LARGEST_FILE, Occupancy
+from leco_plugin.occupancy import LARGEST_FILE, Occupancy, Precision, gate_precision
 from leco_plugin.space import Space
 
 GATES = {
@@ -55,6 +56,12 @@ def parts(content: bytes, folder: Path) -> tuple[dict[str, str], dict[str, Tenso
     path.write_bytes(content)
     with safe_open(path, framework="pt") as file:
         return file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+
+
+@pytest.mark.parametrize("precision", get_args(Precision))
+def test_products_have_the_type_that_the_precision_names(precision) -> None:
+    with gate_precision("cpu", precision):
+        assert (torch.ones(2, 2) @ torch.ones(2, 2)).dtype == getattr(torch, precision)
 
 
 @pytest.mark.parametrize("kind", GATES)

@@ -74,6 +74,13 @@ def test_a_space_travels_with_a_state_dict() -> None:
     assert other.kind == "contraction" and torch.equal(other.map(x), space.map(x))
 
 
+def test_a_space_can_be_set_from_each_kind_to_the_other() -> None:
+    space = Space()
+    for kind in ("contraction", "box"):
+        space.set(kind, torch.ones(3), 2.0)
+        assert space.kind == kind
+
+
 @pytest.mark.parametrize("half_extent", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_half_extent_that_is_not_positive_and_finite_is_refused(half_extent: float) -> None:
     with pytest.raises(ValueError, match="half extent"):

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from leco_plugin.conformance.rules import Rule, apply, require
+from leco_plugin.conformance.estimators import _check_uniform
+from leco_plugin.conformance.rules import Broken, Rule, apply, require
 
 
 class Case:
@@ -111,3 +112,12 @@ def test_a_card_draws_the_same_numbers_whatever_a_case_has_seeded():
     torch.manual_seed(1)
     apply(rule(lambda case: torch.manual_seed(5)), Case())
     assert torch.rand(3, device="cuda").equal(expected)
+
+
+def test_shifts_of_neighbours_are_neither_alike_nor_opposite():
+    generator = torch.Generator().manual_seed(0)
+    _check_uniform(torch.rand(20_000, generator=generator))
+    shares = torch.rand(10_000, generator=generator)
+    for other in (shares, 1.0 - shares):
+        with pytest.raises(Broken, match="correlate by"):
+            _check_uniform(torch.stack([shares, other], dim=1).flatten())

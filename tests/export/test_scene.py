@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from ball_occupancy import CENTRE, RADIUS, ball
+from ball_occupancy import CENTRE, HALF, RADIUS, WALLS, ball
 from scene_files import change, described, refused
 from scipy.spatial.transform import Rotation
 
@@ -25,6 +25,7 @@ from leco_plugin.scenes.city.cameras import look_at
 from leco_plugin.scenes.coloured_points import description_of_run
 from leco_plugin.scenes.frames import APPLIED_EARLIER
 from leco_plugin.scenes.whole_files import write_points
+from leco_plugin.space import Space
 
 ORIGIN = {"latitude": 42.0, "longitude": -76.0, "altitude": 0.0, "axes": "east, north, up"}
 FRAME = [[0.5, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0], [0.0, 0.0, 0.5, 0.0]]
@@ -223,6 +224,21 @@ def test_a_part_that_cannot_be_made_is_one_line_and_the_others_are_written(
         export_folder(file, file, 32)
     with pytest.raises(ValueError, match="no transforms"):
         export_folder(file, tmp_path / "all", 32, tmp_path)
+
+
+def test_points_and_volume_of_a_folder_are_as_fine_as_each_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between walls a volume is flat, and has more cells along its sides than a cube."""
+    for name in ("draw", "write_page"):  # seconds
+        monkeypatch.setattr(f"leco_plugin.export.{name}", lambda *_, **__: None)
+    monkeypatch.setattr("leco_plugin.export_surface.CELLS", 16)
+    known, unbounded = ball(), Space("contraction", CENTRE, HALF)
+    Occupancy(known.gate, unbounded, known.threshold, walls=WALLS).save(tmp_path / "o.st")
+    parts, _ = export_folder(tmp_path / "o.st", tmp_path / "all")
+    cells = {part.name: part.facts["resolution"] for part in parts[2:] if part.facts}
+    alone = export(tmp_path / "o.st", "npz", tmp_path / "v.npz")["resolution"]
+    assert cells == {"kept.ply": 16, "volume.npz": alone} and alone == 18
 
 
 def run_config(file: Path, data: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import inspect
+import math
 from typing import Any
 
 import pytest
@@ -172,7 +173,8 @@ def test_rays_of_a_bounded_occupancy_end_so_where_pictures_show_something_there(
     origins = torch.tensor([[0.0, 0.0, -3.0], [0.0, 5.0, -3.0]])  # one ray meets the box
     directions = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]])
     march: dict[str, Any] = {"far_plane": 40.0, "render_step_size": 0.5}
-    for price, ends in ((0.0, []), (0.5, []), ("?", []), (2.0, [4.0, 40.0])):
+    prices = ((0.0, []), (0.5, []), ("?", []), (math.inf, []), (2.0, [4.0, 40.0]))
+    for price, ends in prices:
         guide, report = Guide(), {BACKDROP_PRICE: price}
         space = Space("box", (0.0, 0.0, 0.0), 1.0)
         guide.set_occupancy(Occupancy(ball().gate, space, 2.0, report=report, walls=walls))
