@@ -118,8 +118,8 @@ def quote(report: dict[str, Any]) -> str:
             f"All three took {minutes:.0f} minutes on two CPU cores. At the end "
             f"{costs['empty_fraction']:.0%} of all places on rays are skipped. The gates of this "
             f"run hide {costs['lost_surface_mass']:.2%} of the surfaces in held-out pixels. Of "
-            f"{photographs} that taught them nothing, the worst lost {worst[0]:.1%}"
-            + "".join(f" ({other:.1%} in another run)" for other in worst[1:])
+            f"{photographs} that taught them nothing, the worst lost {worst[0]:.2%}"
+            + "".join(f" ({other:.2%} in another run)" for other in worst[1:])
             + ".",
         ]
     )
