@@ -91,7 +91,7 @@ class Places:
             ends = torch.tensor(self.sizes).cumsum(0).tolist()
             self.filling = [slice(end - rows, end) for end, rows in zip(ends, filled) if rows]
             before = (torch.tensor(filled).cumsum(0) - torch.tensor(filled)).to(device)
-            slots = numbers + before.index_select(0, keys.index_select(0, sources))
+            slots = numbers + before.index_select(0, ordered)
             self.sources = sources.new_zeros(ends[-1]).scatter_(0, slots, sources)
         self.slots = torch.empty_like(sources).scatter_(0, sources, slots)
 
