@@ -1,4 +1,4 @@
-"""What the CPU decides by but keeps on a device, read without waiting for the device each time."""
+"""Small values on a device that the CPU decides by, read without waiting for it each time."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
 _known = WeakIdKeyDictionary()
-"""Of tensors of devices, how often torch had counted a write, and their values then."""
+"""For each tensor: how many writes torch had counted, and its values then, on the CPU."""
 
 
 def on_cpu(tensor: Tensor) -> Tensor:
-    """The values of a small buffer, to be read only. They are copied anew, which waits for its
-    device, where it was written to since the last time; what is not counted is said at
-    `samplers.base.Snapshot`."""
+    """The values of a small buffer, to be read only. They are copied, which waits for its device,
+    only if torch has counted a write since the last copy; `samplers.base.Snapshot` names the writes
+    that it does not count."""
     if tensor.device.type == "cpu":
         return tensor
     if tensor.is_inference():  # no write is counted

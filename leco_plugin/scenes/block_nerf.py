@@ -36,7 +36,7 @@ DISTORTION = ("k1", "k2", "p1", "p2")
 ACROSS, DOWN = 32, 24
 """Rays of a picture that its camera is fitted to."""
 LENSES = 16
-"""Pictures of a camera to which a lens is fitted, the best of which is kept: turning bends rays."""
+"""Pictures of a camera to which a lens is fitted. The best is kept: a car that turns bends rays."""
 STRAIGHT = 0.1
 """Pixels (root mean square) within which a lens is fitted without distortion."""
 NO_CAMERA = 0.05

@@ -151,7 +151,8 @@ def _without_strays(points: Tensor, poses: Tensor | None) -> tuple[Tensor, str]:
 
 
 def distances_from_middle(places: Tensor) -> Tensor:
-    """Distances [C] of places [C, 3] from their middle, over that of most; 0 if these lie there."""
+    """Distances [C] of places [C, 3] from their middle, over that within which most lie; 0 if
+    most lie at one place."""
     away = (places - places.median(dim=0).values).norm(dim=-1)
     return (away / away.quantile(NEARER)).nan_to_num(0.0, posinf=0.0)
 

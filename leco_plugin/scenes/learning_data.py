@@ -47,7 +47,8 @@ SHARE_THAT_VOUCHES = 4
 
 
 class LearningData:
-    """A data manager as a learner sees it; near and far by hand. InputError as `survey`."""
+    """A data manager as a learner sees it. Bounds, near and far are what is set by hand. InputError
+    as `survey`."""
 
     def __init__(
         self, manager: Any, bounds: BoundsConfig, near: float | None, far: float | None
@@ -138,7 +139,8 @@ class LearningData:
         return held_out_rays(mixture, self.manager, count, seed, share)
 
     def training_rays(self, mixture: Mixture, count: int, set_aside: int = 0) -> Rays:
-        """Rays [count] of training pixels, cut to a mixture's region; `set_aside` is for these."""
+        """Rays [count] of random training pixels, cut to a mixture's region. `set_aside` is as of
+        `prepare_batch`, and for this draw only."""
         self.prepare_batch(1.0, distances=False, set_aside=set_aside)
         drawn = [_rays_of(mixture, each) for each in training_bundles(self.manager, count)]
         self.prepare_batch(1.0, distances=False)

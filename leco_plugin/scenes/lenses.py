@@ -38,7 +38,8 @@ FAR_OUTSIDE = 4.0
 
 @dataclass(frozen=True)
 class Lens:
-    """The lens of a frame in pixels of its full size, by default in its middle; None: not said."""
+    """The lens of a frame, in pixels of its full size; None is not said. Without cx and cy it has
+    the middle, if its size is said."""
 
     kind: CameraType | None
     fx: float | None
@@ -57,7 +58,7 @@ class Lens:
     def focal_lengths(
         self, width: float, height: float, factor: int
     ) -> tuple[float, float] | tuple[None, None]:
-        """Focal lengths in pixels of a picture smaller by `factor`; None of an unknown lens."""
+        """Focal lengths in pixels of a picture smaller by `factor`; None if the lens has none."""
         across = self.fx, self.angle_x, width if self.width is None else self.width / factor
         down = self.fy, self.angle_y, height if self.height is None else self.height / factor
         found = [
@@ -97,7 +98,8 @@ def lens_of(meta: dict[str, Any], frame: dict[str, Any], where: str) -> Lens:
 
 
 def set_lenses(cameras: Cameras, lenses: list[Lens | None], factor: int) -> None:
-    """Gives cameras of pictures smaller by `factor` their lenses, in place; of None their own."""
+    """Gives each camera its lens, in place, or leaves it its own for None. Pictures are smaller by
+    `factor` than lenses are for."""
     for name in ("fx", "fy", "cx", "cy", "camera_type", "distortion_params"):
         if (shared := getattr(cameras, name)) is not None:  # by all, where they had one value
             setattr(cameras, name, shared.expand(len(lenses), -1).clone())

@@ -55,7 +55,8 @@ def begins_with(path: Path, mark: bytes) -> bool:
 
 
 def write_json(path: Path, value: Any, indent: int = 2, allow_nan: bool = False) -> None:
-    """Writes JSON whole or not at all; folders are made. ValueError for NaN, unless allowed."""
+    """Writes JSON whole or not at all; folders are made. ValueError for NaN and
+    infinity, unless allowed."""
     text = json.dumps(value, indent=indent, allow_nan=allow_nan) + "\n"
     write_whole(path, text.encode())
 
@@ -145,7 +146,8 @@ LOCK = ".running"
 
 @contextmanager
 def alone_in(folder: Path, work: str) -> Iterator[None]:
-    """Makes a folder, and keeps others from the same `work` in it. InputError if one is at it."""
+    """Makes a folder, and keeps other processes from the same `work` in it. InputError if one is at
+    work there, or nothing can be written there."""
     with writing_into(folder, "--out"):
         folder.mkdir(parents=True, exist_ok=True)
         held = lock(folder)

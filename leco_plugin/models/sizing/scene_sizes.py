@@ -43,7 +43,7 @@ ENTRIES_PER_TEXEL = 2.5
 corners for each of its cells, and where it runs across the grid some more."""
 TEXELS_PER_EXPERT = 1 << 20
 """Texels for each scene expert. With one, surveys and cities of up to 750,000 texels were learned
-better than with four, which exchange many of their points while they learn."""
+as well as with four or better: four exchange many of their points while they learn."""
 TEXELS_OF_A_WHOLE_EXPERT = 1 << 16
 """Texels from which on a scene expert is as wide as the device's; for fewer it is narrower."""
 CELLS_PER_PERIOD = 32

@@ -182,7 +182,8 @@ class Tracer:
         return faces, depths
 
     def colour(self, origins: Array, directions: Array, angle: float) -> tuple[Colours, Array]:
-        """Light [N, 3], RGB in 0..1, and depth [N], metres, along rays [N, 3] of so wide pixels."""
+        """Light [N, 3], RGB in 0..1, and depth [N], metres, along rays [N, 3] whose
+        pixels are `angle` radians wide."""
         faces, depths = self.cast(origins, directions)
         has_sky = self.city.config.sky
         colours = sky(directions) if has_sky else np.zeros(directions.shape, np.float32)

@@ -204,7 +204,8 @@ class HeldOutPixelSampler(PixelSampler):
 
     def shown(self, pixels: Tensor, sizes: Tensor, numbers: Tensor | None = None) -> Tensor:
         """Whether a fisheye shows pixels (image, row, column) [N, 3]: bool [N]. Sizes (height,
-        width) are [2] or [N, 2]; `numbers` are the dataset's, of images numbered by batch."""
+        width) are [2] or [N, 2]; `numbers` [P] are the dataset's, if images are places in a
+        batch."""
         radius: Any = self.config.fisheye_crop_radius
         if self.radii is not None:
             images = pixels[:, 0].cpu()

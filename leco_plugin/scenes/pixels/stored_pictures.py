@@ -33,7 +33,7 @@ class StoredPictures:
         return len(self.files)
 
     def draw(self, count: int, by_solid_angle: bool = False) -> Tensor:
-        """Pixels [count, 3] (picture, row, column), all alike likely, or by their solid angle."""
+        """Random pixels [count, 3] (picture, row, column), all alike or by their solid angle."""
         total = int(self._pixels_until[-1])
         drawn = torch.randint(total, (count,))
         which = torch.searchsorted(self._pixels_until, drawn, right=True)

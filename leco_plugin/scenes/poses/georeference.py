@@ -104,10 +104,10 @@ def place(
     altitudes: bool = True,
 ) -> Placement:
     """The similarity that takes a reconstruction to metres, or a rotation that sets it upright.
-    Centres [C, 3] have positions by GPS [C, 3] in metres, or nan; `up` [3] rolls a flight along one
-    line. The mean `top` [3] of the photographs' top edges counts where GPS would turn it upside
-    down, right edges `rights` [C, 3] where altitudes would tilt it. Where altitudes are not known,
-    or contradict the poses, `up` takes their place."""
+    Centres [C, 3] have positions by GPS [C, 3] in metres, or nan. A flight along one line also
+    needs what is `up` [3]. The mean `top` [3] of the photographs' top edges counts where GPS would
+    turn it upside down, right edges `rights` [C, 3] where altitudes would tilt it. Where altitudes
+    are not known, or contradict the poses, `up` takes their place."""
     placed = _place_in_space(pycolmap, centres, gps, up, top)
     tilts = placed.residuals is not None and _is_tilted(placed.turn, up, rights)
     if altitudes and placed.residuals is not None and not tilts:

@@ -350,7 +350,7 @@ def _write(photograph: Photograph, image: Image.Image, path: Path) -> None:
 
 
 def _upright_exif(image: Image.Image, kind: str) -> bytes:
-    """EXIF of an image turned upright; that alone where the rest cannot be written, or is long."""
+    """EXIF of an image turned upright: only this, if the rest cannot be written or is too long."""
     upright = Image.Exif()
     upright[ExifTags.Base.Orientation] = 1
     with suppress(Exception):  # tags of another type than the standard's raise many errors
