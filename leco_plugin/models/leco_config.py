@@ -86,7 +86,8 @@ class LecoModelConfig(ModelConfig):
     measured to be no slower, which is in C on a CPU and, without C, for guided batches of 2048 rays
     or more there."""
     homogeneous: bool = False
-    """A mixture of scene experts only, for comparison: no empty-space expert, nothing to freeze."""
+    """A mixture of scene experts only, for comparison: no empty-space expert, nothing to freeze.
+    With one scene expert, as most scenes have, it mixes nothing: set `sizes.gate.scene-experts`."""
     precision: Precision | None = None
     """Of matrix products, while learning and wherever the gate is asked; None is what the device is
     fastest in. What C renders on a CPU is in float32."""
