@@ -95,6 +95,16 @@ def test_the_table_follows_the_surface_and_the_cells_its_side() -> None:
     assert octaves == [octaves[0] + k for k in range(4)]
 
 
+def test_experts_follow_millions_of_texels_and_their_width_follows_few() -> None:
+    numbers = {1e5: (1, 1), 2.0**20: (1, 1), 1.5e6: (2, 2), 3e6: (3, 3), 1e7: (4, 8)}
+    for texels, expected in numbers.items():
+        found = [chosen(most, scene(texels, 4000.0)).field.experts for most in (SMALL, LARGE)]
+        assert tuple(each.scene_experts for each in found) == expected
+        assert [each.width for each in found] == [64, 128]
+    narrow = chosen(SMALL, scene(2.0**14, 4000.0)).field.experts
+    assert (narrow.scene_experts, narrow.width) == (1, 32)
+
+
 @few
 @given(
     path=st.sampled_from(CHOSEN),
