@@ -151,9 +151,8 @@ def check_shifts(case: SamplerCase) -> None:
 def no_gradient_to_the_gate(case: SamplerCase) -> None:
     sampler, field = case.shared(SLAB).train(), Field()
     origins, directions = (part.clone().requires_grad_() for part in kit.crossing()[:2])
-    rays = kit.crossing()._replace(
-        origins=origins, directions=directions
-    )  # cameras may be optimised
+    # cameras may be optimised
+    rays = kit.crossing()._replace(origins=origins, directions=directions)
     colours = case.colours(sampler, rays, field)
     require(torch.is_grad_enabled(), "sampling leaves gradients switched off")
     colours.square().sum().backward()
@@ -174,9 +173,8 @@ def state_dict_round_trip(case: SamplerCase) -> None:
     """The checkpoint of one scene turns a sampler of another scene into the first."""
     source, rays = case.shared(kit.EVERYTHING), kit.crossing()
     restored = case.build(kit.OTHER.occupancy(case.gate_encoding) if case.needs_occupancy else None)
-    case.sample(
-        restored.eval(), rays, kit.OTHER
-    )  # what is derived at first use is of the other scene
+    # what is derived at first use is of the other scene
+    case.sample(restored.eval(), rays, kit.OTHER)
     restored.load_state_dict(reloaded(source.state_dict()))
     samples = case.sample(restored.eval(), rays, kit.EVERYTHING)
     require(
