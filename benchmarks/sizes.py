@@ -1,11 +1,12 @@
 """Automatic sizes against a sweep: `python benchmarks/sizes.py [SCENE ...]`.
 
 `leco-occupancy` trains for the same number of steps, on drone surveys of cities and on scenes that
-are named: in the sizes that it chooses, in those of the device, with smaller and larger tables and
-with fewer experts than chosen; on the largest city in automatic sizes and larger ones only. Steps
-and not seconds: it may run beside other work. A run is stored when it is done; a benchmark that was
-stopped goes on there, and a run is known by its scene, sizes and seed, whatever code made it, which
-the page says. `--dry-run` passes through everything in seconds and means nothing.
+are named: in the sizes that it chooses, in those of the device, with smaller and larger tables and,
+where it chooses several scene experts, with half of them; on the largest city in automatic sizes
+and larger ones only. Steps and not seconds: it may run beside other work. A run is stored when it
+is done; a benchmark that was stopped goes on there, and a run is known by its scene, sizes and
+seed, whatever code made it, which the page says. `--dry-run` passes through everything in seconds
+and means nothing.
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ def is_grouping_faster(device: torch.device, n: int, width: int) -> bool:
             _log.warning("no grouped products, one for each expert in their place: %s", reason)
             return False
     _log.info(
-        "%d experts of width %d on %s: %.3f ms a layer grouped, %.3f ms one by one",
+        "experts: %d of width %d on %s: %.3f ms a layer grouped, %.3f ms one by one",
         *(n, width, device, 1e3 * grouped, 1e3 * plain),
     )
     return grouped <= plain
