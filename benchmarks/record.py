@@ -26,6 +26,8 @@ import torch
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
 
+from leco_plugin.chart.contender import changed
+from leco_plugin.chart.methods import SEVERAL_EXPERTS
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.occupancy import Occupancy
 
@@ -49,6 +51,9 @@ def run(data: Path, seed: int, folder: Path) -> dict[str, Any]:
     config.logging.local_writer.enable = False
     model: Any = config.pipeline.model
     model.schedule = replace(model.schedule, learn_steps=STEPS // 2, earliest=1.0)
+    for path, value in SEVERAL_EXPERTS.items():  # as when the record was made
+        model = changed(model, path, value)
+    config.pipeline.model = model
     config.set_timestamp()
     writer.EVENT_WRITERS.clear()
     writer.GLOBAL_BUFFER.clear()

@@ -70,7 +70,9 @@ with [how to read them](measurements.md#how-to-read-a-table), [Suites](suites.md
 reviewers' questions, and [Who gets what](gifts.md) in a comparison. All is made from
 `benchmarks/results/*.json` by `python benchmarks/results_page.py`; a test fails when they differ.
 Those pages say of which commit each figure is. Where (*) stands, a later change of the code is
-known to matter; the page of its figures says which.
+known to matter; the page of its figures says which. Figures from before 30 November 2026 are of up
+to four scene experts, where today's code has one; that [gains, if
+anything](decisions.md#scene-experts-exchange-their-points-while-they-learn).
 
 ## What is gained in the same time
 """
@@ -333,7 +335,7 @@ def learning_section(report: dict[str, Any]) -> list[str]:
         f"{picture(LEARNING.stem)}\n",
         f"{learning_sentence(report)}. Both are of the later half of learning. Points are spread "
         "over the scene's box; a mean density is of those that an expert gets, per half extent. "
-        "Which scene expert takes what changes to the end; what is empty does not.\n",
+        "Which of four scene experts takes what changes to the end; what is empty does not.\n",
         "![Slices of the occupancy from above and from the side, step by step]"
         "(images/learning.gif)\n",
         f"`ns-train leco-occupancy --data {report['scene']} {recorded}` and `python "

@@ -26,7 +26,7 @@ def sizes_sections() -> list[str]:
             f" {steps} steps each, {learn} of them learning; PSNR of test pixels. Best is the "
             f"smallest that lies within {AS_GOOD:g} dB of the highest mean. Within bounds: at most "
             f"{MAY_LOSE:g} dB behind it, with at most {MAY_HAVE:g} times its parameters. Runs "
-            f"{made_line(report['runs'])}."
+            f"{made_line(report['runs'])}. Experts are by the rule of then, one for 65,536 texels."
         )
         named = [scene["scene"] for scene in report["scenes"] if "blocks" not in scene]
         command = " ".join(["python benchmarks/sizes.py", *named])
