@@ -126,11 +126,12 @@ def lead(results: Mapping[str, Any]) -> str:
     ours = next(line for line in host if line.learned)
     best = max((line for line in host if not line.learned), key=lambda line: line.psnr)
     image, of_best = (_median(line, "render_seconds_per_image") for line in (ours, best))
+    queries, of_others = (_median(line, "field_queries_per_ray") for line in (ours, best))
     return (
         f"**Instant-NGP after {results['protocol']['seconds']:g} s** of one CPU core reaches "
         f"{ours.psnr:.1f} dB with a learned occupancy, {best.psnr:.1f} with the best other way to "
         f"sample. An image takes {image:.1f} s instead of {of_best:.1f}: its network is asked for "
-        f"{_queries(ours)} samples a ray, not {_queries(best)}. Part of that lead is not the "
+        f"{queries:.0f} samples a ray, not {of_others:.0f}. Part of that lead is not the "
         "gate's: see below the table."
     )
 
@@ -157,7 +158,8 @@ def gain_table(results: Mapping[str, Any]) -> str:
         "A query asks a network about one point; *small* ones ask a proposal network or a gate. "
         "*LeCO* is the paper's model: networks, the *experts*, of which the gate chooses one for "
         "each point: one for all that is there, unless the scene is very large. A *host* is a "
-        "method that an occupancy guides. *Long steps* take fewer samples of each ray. PSNR, which "
+        "method that an occupancy guides. What is *never frozen* skips nothing; *long steps* take "
+        "fewer samples of each ray. PSNR, which "
         "is better when higher, is a mean over seeds, with the least and the most; the others are "
         "medians. Behind ± stands a 95% interval."
     )
