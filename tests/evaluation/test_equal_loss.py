@@ -160,7 +160,7 @@ def test_a_tenth_of_the_loss_may_lie_in_what_finer_grids_leave_out(
     places = torch.tensor([[-0.4, 0.0, 0.0], [-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]])
     weights = torch.tensor([5e-5, 5e-4, 1.0])
     monkeypatch.setattr(equal_loss, "_measured", lambda *_: (places, weights, torch.ones(3)))
-    monkeypatch.setattr(equal_loss, "FieldGrids", grids)
+    monkeypatch.setattr(equal_loss.field_grids, "FieldGrids", grids)
     at_equal_loss(mixture, None, grids=(4,))
     assert floors == [2.0]
 
