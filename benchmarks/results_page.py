@@ -71,8 +71,8 @@ reviewers' questions, and [Who gets what](gifts.md) in a comparison. All is made
 `benchmarks/results/*.json` by `python benchmarks/results_page.py`; a test fails when they differ.
 Those pages say of which commit each figure is. Where (*) stands, a later change of the code is
 known to matter; the page of its figures says which. Figures from before 30 November 2026 are of up
-to four scene experts, where today's code has one; that [gains, if
-anything](decisions.md#scene-experts-exchange-their-points-while-they-learn).
+to four scene experts, where today's code has one: [level or better where both were
+measured](decisions.md#scene-experts-exchange-their-points-while-they-learn).
 
 ## What is gained in the same time
 """

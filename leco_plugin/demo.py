@@ -81,7 +81,7 @@ def run_demo(
             guided, budget, sampler="learned-occupancy", on_progress=show
         )
     learned: Any = trainer.pipeline.model
-    left = take_occupancy(trainer, folder, out) if bool(learned.mixture.frozen) else None
+    left = take_occupancy(trainer, folder, out) if learned.mixture.is_frozen else None
     if left is None:
         raise RuntimeError(
             "the time was over before the occupancy was learned: give more with --seconds"

@@ -306,9 +306,12 @@ def _leco(name: str, **changes: object) -> Contender:
     return Contender(name, "leco-occupancy", LEARNED, paths)
 
 
+def _experts(name: str, **changes: object) -> Contender:
+    return _leco(name, **SEVERAL_EXPERTS, **changes)
+
+
 def _paper(name: str, **changes: object) -> Contender:
-    paper = {"gate_loss__form": "paper", "gate_loss__fall_back": False}
-    return _leco(name, **SEVERAL_EXPERTS, **paper, **changes)
+    return _experts(name, gate_loss__form="paper", gate_loss__fall_back=False, **changes)
 
 
 def _empty_mlp(layers: int) -> dict[str, object]:
@@ -324,7 +327,6 @@ def _switch(sampler: str) -> Contender:
 
 
 SCENE_SIZED = _empty_mlp(SCENE_LAYERS)
-NO_EMPTY_EXPERT = {"sizes.field.experts.empty_expert": "none"}
 
 SUITES = {
     "representations": Suite(
@@ -346,10 +348,10 @@ SUITES = {
     "empty-expert": Suite(
         "How small must the empty-space expert be, and what if there is none? (reviews 3 and 6)",
         (
-            _leco("identity (ours)", **SEVERAL_EXPERTS),
-            _leco("MLP of one layer", **SEVERAL_EXPERTS, **_empty_mlp(1)),
-            _leco("as large as a scene expert", **SEVERAL_EXPERTS, **SCENE_SIZED),
-            _leco("none: density is zero", **SEVERAL_EXPERTS, **NO_EMPTY_EXPERT),
+            _experts("identity (ours)"),
+            _experts("MLP of one layer", **_empty_mlp(1)),
+            _experts("as large as a scene expert", **SCENE_SIZED),
+            _experts("none: density is zero", sizes__field__experts__empty_expert="none"),
             _paper("imbalance loss alone, identity", gate_loss__density=0.0),
             _paper("imbalance loss alone, large", gate_loss__density=0.0, **SCENE_SIZED),
         ),
@@ -357,7 +359,7 @@ SUITES = {
     "losses": Suite(
         "What do the losses of the gate do?",
         (
-            _leco("contribution (ours)", **SEVERAL_EXPERTS),
+            _experts("contribution (ours)"),
             _paper("paper: imbalance and density"),
             _paper("paper without density loss", gate_loss__density=0.0),
             _paper(
@@ -391,8 +393,7 @@ SUITES = {
 
 
 def in_order(names: Sequence[str]) -> list[str]:
-    """Names of suites, with `all` or not, in the order of `SUITES`; an `InputError` for an unknown
-    one."""
+    """Names of suites, or `all`, in the order of `SUITES`. InputError for an unknown one."""
     for name in names:
         if name not in SUITES and name != ALL:
             raise InputError(unknown_name("suite", name, [*SUITES, ALL]))
