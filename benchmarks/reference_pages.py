@@ -21,7 +21,8 @@ import tyro
 from page_parts import ROOT, between, table
 
 from leco_plugin.cli import COMMANDS
-from leco_plugin.conformance.cases import RULES  # which adds the checks of hosts
+from leco_plugin.conformance import host_training  # noqa: F401 (registers the checks of hosts)
+from leco_plugin.conformance.cases import RULES
 from leco_plugin.host_configs import leco_ngp, leco_switch_nerf
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.scenes.city_dataparser import leco_city_dataparser

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from leco_plugin.conformance import samplers
 from leco_plugin.conformance import scene as kit
-from leco_plugin.conformance.rules import checks, raises_nothing, require
+from leco_plugin.conformance.rules import checks, raises_nothing, require, require_none
 from leco_plugin.conformance.samplers import SamplerCase
 from leco_plugin.conformance.scene import SLAB, Field, Rays, Slab
 from leco_plugin.occupancy import Occupancy
@@ -132,8 +132,8 @@ def _check_between_planes(case: EstimatorCase, sampler: Any, near: float, far: f
     """Raises unless rays without limits of their own are sampled from near plane to far plane."""
     rays = kit.crossing()
     planes: dict[str, Any] = {"near_plane": near, "far_plane": far, "t_min": None, "t_max": None}
-    ends = {"t_min": torch.full_like(rays.t_min, near), "t_max": torch.full_like(rays.t_max, far)}
-    between = rays._replace(**ends)
+    ends = torch.full_like(rays.t_min, near), torch.full_like(rays.t_max, far)
+    between = Rays(rays.origins, rays.directions, *ends)
     for training in (True, False):
         sampler.train(training)
         with raises_nothing("sampling without t_min and t_max raises"):
@@ -251,8 +251,8 @@ def skips_only_what_it_may(case: EstimatorCase) -> None:
 def _check_skipped_is_not(rays: Rays, samples: Samples, scene: Slab) -> None:
     positions = rays.at(samples[0], (samples[1] + samples[2]) / 2.0)
     outside = scene.depth(positions) < -kit.MARGIN
-    said = f"{int(outside.sum())} of {len(outside)} samples lie where the occupancy is empty"
-    require(not bool(outside.any()), said + _first(positions[outside]))
+    where = _first(positions[outside])
+    require_none(outside, f"{{}} samples lie where the occupancy is empty{where}")
 
 
 def _check_kept_is_sampled(
@@ -264,9 +264,8 @@ def _check_kept_is_sampled(
     """
     ray_indices, middles = _plainly_kept(rays, scene, step, shifted)
     missing = ~kit.covered(ray_indices, middles, samples)
-    places = f"{int(missing.sum())} of {len(missing)} places"
-    said = f"{places} are not sampled although they are occupied"
-    require(not bool(missing.any()), said + _first(rays.at(ray_indices, middles)[missing]))
+    where = _first(rays.at(ray_indices, middles)[missing])
+    require_none(missing, f"{{}} places are not sampled although they are occupied{where}")
 
 
 @functools.lru_cache(maxsize=32)
@@ -370,11 +369,9 @@ def _check_pruned(
         options: dict[str, Any] = {name: function, "stratified": False, **limits}
         kept = kit.among(plain, case.sample(sampler, rays, **options))
         given = f"with {name}, early_stop_eps {eps} and alpha_thre {alpha_thre}"
-        lost = int((visible & ~kept).sum())
-        require(lost == 0, f"{given}: {lost} of {int(visible.sum())} visible samples are dropped")
-        for kind, dropped in (("in the dark", dark), ("too faint to be seen", faint)):
-            left, count = int((dropped & kept).sum()), int(dropped.sum())
-            require(left == 0, f"{given}: {left} of {count} samples {kind} are kept")
+        require_none(~kept[visible], f"{given}: {{}} visible samples are dropped")
+        require_none(kept[dark], f"{given}: {{}} samples in the dark are kept")
+        require_none(kept[faint], f"{given}: {{}} samples too faint to be seen are kept")
 
 
 def _wall(rays: Rays, t_starts: Tensor, t_ends: Tensor, ray_indices: Tensor) -> Tensor:

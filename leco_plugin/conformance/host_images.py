@@ -4,26 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from unittest.mock import patch
 
 import torch
+from nerfacc.estimators.base import AbstractEstimator
+from nerfstudio.cameras.rays import RayBundle, RaySamples
+from nerfstudio.fields.base_field import Field
+from nerfstudio.model_components.ray_samplers import UniformSampler
+from nerfstudio.model_components.renderers import RGBRenderer
+from nerfstudio.models.base_model import Model
+from nerfstudio.utils.colormaps import apply_colormap, apply_depth_colormap
 from torch import Tensor, nn
 
 from leco_plugin.conformance import hosts
 from leco_plugin.conformance import scene as kit
 from leco_plugin.conformance.hosts import HostCase
 from leco_plugin.conformance.proposals import CHORD, INSIDE, NEARBY, chords
-from leco_plugin.conformance.rules import checks, raises_nothing, require
+from leco_plugin.conformance.rules import checks, raises_nothing, require, require_none
 from leco_plugin.conformance.samplers import check_tensor, devices, of_two_seeds
 from leco_plugin.conformance.scene import SLAB, Rays
 from leco_plugin.hosts.stand_ins import GuidedEstimator, GuidedProposal, is_packed
 from leco_plugin.samplers.base import DenseEstimator, Estimator
 from leco_plugin.samplers.marching import Samples
-
-if TYPE_CHECKING:
-    from nerfstudio.cameras.rays import RayBundle
-    from nerfstudio.models.base_model import Model
 
 DENSE = 512
 """Samples of each ray of a proposal host that is sampled densely."""
@@ -37,9 +40,6 @@ def asked_and_sampled(model: Model) -> tuple[Tensor, Tensor]:
     A field is any `Field` of nerfstudio that is called with samples. Of a host that has none, what
     its sampler returns counts as asked.
     """
-    from nerfstudio.cameras.rays import RaySamples
-    from nerfstudio.fields.base_field import Field
-
     asked: list[Tensor] = []
     sampled: list[Tensor] = []
 
@@ -84,8 +84,6 @@ def _noting(seam: GuidedEstimator | GuidedProposal, sampled: list[Tensor]) -> An
 def sample_densely(model: Model) -> Iterator[None]:
     """While this lasts, a guided host, or a packed one with its own estimator, samples all of the
     box, or all of each ray."""
-    from nerfacc.estimators.base import AbstractEstimator
-
     with ExitStack() as stack:
         for module in model.modules():
             if isinstance(module, GuidedEstimator | AbstractEstimator | Estimator):
@@ -100,8 +98,6 @@ def _all_of_each_ray(
     ray_bundle: Any, density_fns: Any = None, **_: Any
 ) -> tuple[Any, list[Tensor], list[Any]]:
     """Evenly spaced samples, as a proposal sampler returns them."""
-    from nerfstudio.model_components.ray_samplers import UniformSampler
-
     samples = UniformSampler(DENSE, train_stratified=False)(ray_bundle)
     weights = torch.full_like(samples.frustums.starts, 1.0 / DENSE)
     levels = 1 if density_fns is None else len(density_fns)
@@ -128,23 +124,18 @@ def outputs_can_be_drawn(case: HostCase) -> None:
             flat = model(rays)
             images = model.get_outputs_for_camera(hosts.cameras()[:1].to(device))
         for name, channels in CHANNELS.items():
-            _check_output(name, flat.get(name), (len(rays), channels), rays.origins)
+            value, wanted = flat.get(name), [len(rays), channels]
+            require(isinstance(value, Tensor), f"there is no output {name!r}")
+            found = list(value.shape)
+            require(found == wanted, f"the output {name!r} has shape {found}, not {wanted}")
+            check_tensor(f"the output {name!r}", value, rays.origins)
         for name, image in images.items():
             _check_picture(name, image)
         model.to("cpu")
 
 
-def _check_output(name: str, value: Any, shape: tuple[int, int], rays: Tensor) -> None:
-    require(isinstance(value, Tensor), f"there is no output {name!r}")
-    found = tuple(value.shape)
-    require(found == shape, f"the output {name!r} has shape {list(found)}, not {list(shape)}")
-    check_tensor(f"the output {name!r}", value, rays)
-
-
 def _check_picture(name: str, image: Tensor) -> None:
     """As ns-render and the viewer make one of an output."""
-    from nerfstudio.utils.colormaps import apply_colormap, apply_depth_colormap
-
     draw = apply_depth_colormap if "depth" in name else apply_colormap
     what = f"{image.dtype} with {image.shape[-1]} channels"
     with raises_nothing(f"no picture can be made of the output {name!r}, {what}:"):
@@ -169,17 +160,18 @@ def rendered(model: Model, rays: RayBundle, seed: int = 0) -> dict[str, Tensor]:
 
 @checks("empty-rays-show-background", "host")
 def empty_rays_show_background(case: HostCase) -> None:
-    for why, model, rays in (
-        ("rays that miss the scene", case.shared(SLAB), hosts.turned_away),
-        ("an occupancy that keeps nothing", case.shared(kit.NOTHING), hosts.bundle),
+    for why, scene, away in (
+        ("rays that miss the scene", SLAB, True),
+        ("an occupancy that keeps nothing", kit.NOTHING, False),
     ):
-        outputs = rendered(model, rays())
+        model = case.shared(scene)
+        outputs = rendered(model, hosts.bundle(away))
         for name in CHANNELS:
             finite = bool(outputs[name].isfinite().all())
             require(finite, f"{why}: the output {name!r} holds values that are not finite")
         if is_packed(model):
             _check_background(why, model, outputs)
-        loss = hosts.loss_of(model.train(), rays(), hosts.batch())
+        loss = hosts.loss_of(model.train(), hosts.bundle(away), hosts.batch())
         require(bool(loss.isfinite()), f"{why}: the loss is {loss.item()}")
         require(loss.requires_grad, f"{why}: the loss has no gradient, so that the step fails")
         loss.backward()  # type: ignore[no-untyped-call]
@@ -193,26 +185,14 @@ def _check_background(why: str, model: Model, outputs: dict[str, Tensor]) -> Non
     """A ray without samples has met nothing, and has the colour that the host's renderer names."""
     most = float(outputs["accumulation"].max())
     require(most <= OPAQUE, f"{why}: a ray that has no samples has accumulation {most:.2g}")
-    colour = _background_of(model)
-    if colour is not None:
-        rgb = outputs["rgb"]
-        shown = torch.allclose(rgb, colour.expand_as(rgb), atol=1e-3)
-        require(shown, f"{why}: colours {_listed(rgb[0])} instead of {_listed(colour)}")
-
-
-def _background_of(model: Model) -> Tensor | None:
-    """The background of a host that has one colour for it."""
-    from nerfstudio.model_components.renderers import RGBRenderer
-
     renderers = [module for module in model.modules() if isinstance(module, RGBRenderer)]
     if len(renderers) != 1 or renderers[0].background_color in ("random", "last_sample"):
-        return None
-    colour = renderers[0].background_color
-    return renderers[0].get_background_color(colour, (3,), torch.device("cpu"))
-
-
-def _listed(colour: Tensor) -> list[float]:
-    return [round(value, 2) for value in colour.tolist()]
+        return  # it has no one colour
+    named, rgb = renderers[0].background_color, outputs["rgb"]
+    colour = renderers[0].get_background_color(named, (3,), torch.device("cpu"))
+    shown = torch.allclose(rgb, colour.expand_as(rgb), atol=1e-3)
+    found, wanted = ([round(x, 2) for x in one.tolist()] for one in (rgb[0], colour))
+    require(shown, f"{why}: colours {found} instead of {wanted}")
 
 
 @checks("shades-only-what-is-kept", "host")
@@ -229,27 +209,21 @@ def shades_only_what_is_kept(case: HostCase) -> None:
         model = case.shared(scene, moved).train(training)
         positions, sampled = asked_and_sampled(model)
         depths = scene.depth(positions)
-        met = _rays_through(positions[depths > 0.0], rays.origins, rays.directions)
-        bare = int((~met).sum())
-        require(bare == 0, f"{bare} of {len(met)} rays have no sample in what is occupied")
+        offsets = positions[depths > 0.0] - rays.origins[:, None]
+        beside = torch.linalg.cross(offsets, rays.directions[:, None].expand_as(offsets))
+        met = (beside.norm(dim=-1) < 1e-3).any(dim=1)
+        require_none(~met, "{} rays have no sample in what is occupied")
         if not is_packed(model):
             near = float((depths > -NEARBY).float().mean())
             require(near >= INSIDE, f"{near:.0%} of all samples lie in or near what is occupied")
             continue
         if not scene.unbounded:  # where a ray ends in a backdrop, whatever is there
-            outside = int((depths < -kit.MARGIN).sum())
-            share = f"{outside} of {len(depths)} places"
-            require(outside == 0, f"the field is asked about {share} where all is empty")
+            outside = depths < -kit.MARGIN
+            require_none(outside, "the field is asked about {} places where all is empty")
         if not training:
-            _check_same_places(positions, sampled)
-
-
-def _check_same_places(asked: Tensor, sampled: Tensor) -> None:
-    """Raises unless the field is asked about each sample [M, 3], and about nothing else [N, 3]."""
-    left_out, count = int(_apart(sampled, asked).sum()), len(sampled)
-    require(left_out == 0, f"{left_out} of {count} samples that are kept are not shaded")
-    more, count = int(_apart(asked, sampled).sum()), len(asked)
-    require(more == 0, f"the field is asked about {more} of {count} places that are no samples")
+            require_none(_apart(sampled, positions), "{} samples that are kept are not shaded")
+            more = _apart(positions, sampled)
+            require_none(more, "the field is asked about {} places that are no samples")
 
 
 def _apart(positions: Tensor, others: Tensor) -> Tensor:
@@ -258,13 +232,6 @@ def _apart(positions: Tensor, others: Tensor) -> Tensor:
 
     distances, _ = cKDTree(others.double().numpy()).query(positions.double().numpy())
     return torch.from_numpy(distances) > kit.ROUNDING + RELATIVE * positions.norm(dim=-1)
-
-
-def _rays_through(positions: Tensor, origins: Tensor, directions: Tensor) -> Tensor:
-    """Which rays [R, 3] have one of the positions [N, 3] on them: bool [R]."""
-    offsets = positions - origins[:, None]
-    beside = torch.linalg.cross(offsets, directions[:, None].expand_as(offsets)).norm(dim=-1)
-    return (beside < 1e-3).any(dim=1)
 
 
 @checks("guided-by-everything-is-dense", "host")

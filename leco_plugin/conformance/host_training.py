@@ -9,12 +9,19 @@ import random
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+import yaml  # type: ignore[import-untyped]
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.engine.callbacks import TrainingCallbackLocation as Location
+from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.models.base_model import Model
 from PIL import Image
 from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
 
 from leco_plugin.conformance import hosts
 from leco_plugin.conformance.host_images import asked_and_sampled, rendered, sample_densely
@@ -22,12 +29,8 @@ from leco_plugin.conformance.hosts import HostCase
 from leco_plugin.conformance.rules import checks, require
 from leco_plugin.conformance.samplers import on_two_ranks, reloaded
 from leco_plugin.conformance.scene import CENTRE, HALF, SLAB
+from leco_plugin.hosts.seams import PACKED, PROPOSAL
 from leco_plugin.log import first_of
-
-if TYPE_CHECKING:
-    from nerfstudio.engine.callbacks import TrainingCallbackLocation
-    from nerfstudio.engine.trainer import TrainerConfig
-    from nerfstudio.models.base_model import Model
 
 GUIDE = "leco_guide."
 """How the names of what belongs to the guide of a host begin."""
@@ -77,8 +80,6 @@ def gradients_of_a_step(model: Model) -> dict[str, Tensor]:
 
 @checks("nothing-superfluous-is-left", "host")
 def nothing_superfluous_is_left(case: HostCase) -> None:
-    from leco_plugin.hosts.seams import PACKED, PROPOSAL
-
     own, model = case.unguided(), case.shared()
     for adapter in (PACKED, PROPOSAL):
         require(not adapter.fits(model), f"the host still holds {adapter.description}")
@@ -109,8 +110,6 @@ ROUNDING = 1e-3
 @checks("state-and-yaml-round-trip", "host")
 def state_and_yaml_round_trip(case: HostCase) -> None:
     """A run folder is all that it takes: its config.yml, its checkpoint, and no other file."""
-    import yaml  # type: ignore[import-untyped]
-
     model = case.shared()
     expected = rendered(model, hosts.bundle())
     with TemporaryDirectory() as folder:
@@ -136,33 +135,27 @@ class Run:
 
     def begin(self, config: TrainerConfig, owner: Any) -> None:
         """Makes optimizers and callbacks of a model, or of a pipeline."""
-        from nerfstudio.engine.optimizers import Optimizers
-
         self.optimizers = Optimizers(copy.deepcopy(config.optimizers), owner.get_param_groups())
         self.callbacks = hosts.callbacks(owner, self.optimizers)
 
     def step(self, step: int) -> float:
         """Takes a step, with random numbers of its own; returns the loss."""
-        from nerfstudio.engine.callbacks import TrainingCallbackLocation as Location
-
         torch.manual_seed(step)
         self.model.train()
-        self._call(step, Location.BEFORE_TRAIN_ITERATION)
+        for callback in self.callbacks:
+            callback.run_callback_at_location(step, Location.BEFORE_TRAIN_ITERATION)
         self.optimizers.zero_grad_all()
         loss = self.loss(step)
         loss.backward()  # type: ignore[no-untyped-call]
         self.optimizers.optimizer_step_all()
         for scheduler in self.optimizers.schedulers.values():
             scheduler.step()
-        self._call(step, Location.AFTER_TRAIN_ITERATION)
+        for callback in self.callbacks:
+            callback.run_callback_at_location(step, Location.AFTER_TRAIN_ITERATION)
         return float(loss.detach())
 
     def loss(self, step: int) -> Tensor:
         return hosts.loss_of(self.model, hosts.bundle(), hosts.batch())
-
-    def _call(self, step: int, location: TrainingCallbackLocation) -> None:
-        for callback in self.callbacks:
-            callback.run_callback_at_location(step, location)
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint holds."""
@@ -229,8 +222,6 @@ def two_processes_step_alike(case: HostCase) -> None:
 
 def gradients_of_rank(config: Any, rank: int) -> dict[str, Tensor]:
     """Gradients that a rank of data-parallel training gets from its half of the batch."""
-    from torch.nn.parallel import DistributedDataParallel
-
     model = hosts.build(config, seed=rank)
     hosts.callbacks(model)
     parallel = DistributedDataParallel(model, find_unused_parameters=True)
@@ -315,8 +306,6 @@ def held_out_images_teach_nothing(case: HostCase) -> None:
 
 def reading(config: Any, folder: Path) -> Any:
     """The config of a method, whose data manager reads a folder in nerfstudio's format."""
-    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-
     config = copy.deepcopy(config)
     manager = config.pipeline.datamanager
     parser = manager.dataparser

@@ -1,7 +1,4 @@
-"""Registered methods, built guided on a known scene, as the rules for hosts check them.
-
-What needs nerfstudio is imported when it is called: a sampler is checked without.
-"""
+"""Registered methods, built guided on a known scene, as the rules for hosts check them."""
 
 from __future__ import annotations
 
@@ -15,26 +12,29 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.models.base_model import Model
+from nerfstudio.pipelines.base_pipeline import Pipeline
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from leco_plugin.conformance.rules import Case
 from leco_plugin.conformance.scene import CENTRE, DISTANCE, HERE, MOVED, SLAB, Slab, box
+from leco_plugin.hosts.guided import GuidedModelConfig
 from leco_plugin.models.encodings import Kind
+from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.boxes import intersect_box
 from leco_plugin.samplers.registry import sampler_spec
 from leco_plugin.scenes.input_error import InputError
-
-if TYPE_CHECKING:
-    from nerfstudio.cameras.cameras import Cameras
-    from nerfstudio.cameras.rays import RayBundle
-    from nerfstudio.engine.callbacks import TrainingCallback
-    from nerfstudio.engine.trainer import TrainerConfig
-    from nerfstudio.models.base_model import Model
 
 FROM = ((1.0, 0.4, 0.5), (0.3, 1.0, 0.6), (-0.8, -0.9, -0.1), (-0.4, -0.6, -1.0))
 """Directions in which cameras lie from the centre of the box, to both sides of the slab."""
@@ -46,8 +46,6 @@ SEEN = 0.8
 
 def cameras() -> Cameras:
     """Around the box, looking at its centre."""
-    from nerfstudio.cameras.cameras import Cameras
-
     backward = normalize(torch.tensor(FROM), dim=-1)
     upward = torch.tensor([0.0, 0.0, 1.0]).expand_as(backward)
     right = normalize(torch.linalg.cross(upward, backward), dim=-1)
@@ -62,17 +60,12 @@ def _pixels() -> Tensor:
     return torch.cartesian_prod(*map(torch.arange, (CAMERAS, SIDE, SIDE)))
 
 
-def bundle() -> RayBundle:
-    """Rays through all pixels of all cameras, [CAMERAS * SIDE^2], as a data manager gives them."""
+def bundle(away: bool = False) -> RayBundle:
+    """Rays through all pixels of all cameras, [CAMERAS * SIDE^2], as a data manager gives them; or
+    in the opposite direction, where there is nothing."""
     pixels = _pixels()
     rays: RayBundle = cameras().generate_rays(pixels[:, :1], coords=pixels[:, 1:] + 0.5)
-    return rays
-
-
-def turned_away() -> RayBundle:
-    """The same rays in the opposite direction, where there is nothing."""
-    rays = bundle()
-    rays.directions = -rays.directions
+    rays.directions = -rays.directions if away else rays.directions
     return rays
 
 
@@ -96,8 +89,6 @@ def batch() -> dict[str, Tensor]:
 
 def model_arguments() -> dict[str, Any]:
     """What nerfstudio's pipeline gives a model when it builds it."""
-    from nerfstudio.data.scene_box import SceneBox
-
     return {
         "scene_box": SceneBox(box().view(2, 3)),
         "num_train_data": CAMERAS,
@@ -123,14 +114,9 @@ def pipeline_of(model: Any) -> Any:
 
 
 class HostCase(Case):
-    """A method whose model is guided: as it is, or with its sampler swapped.
-
-    Attributes:
-        config: of the method, guided by a file that holds the occupancy of `SLAB`.
-
-    Raises:
-        InputError: there is no such method, or none that an occupancy could guide.
-    """
+    """A method whose model is guided: as it is, or with its sampler swapped. Its config has the
+    file of an occupancy of `SLAB`. InputError where there is no such method, or none that an
+    occupancy could guide."""
 
     seam = "host"
     imports = ("torch", "torchmetrics", "leco_plugin.hosts.guided")
@@ -176,8 +162,6 @@ class HostCase(Case):
 def guided(name: str, file: Path) -> tuple[TrainerConfig, Kind]:
     """The config of a method, guided by a file, and the features its gate must be on; errors as of
     `HostCase`."""
-    from leco_plugin.hosts.guided import GuidedModelConfig
-    from leco_plugin.models.leco_config import LecoModelConfig
     from leco_plugin.swap import registered, with_sampler_swapped
 
     config = registered(name)
@@ -210,9 +194,6 @@ def build(config: Any, seed: int = 0) -> Model:
 def callbacks(owner: Any, optimizers: Any = None) -> list[TrainingCallback]:
     """What a model, or a pipeline, wants to be called at in a run; asking for it is what begins
     one."""
-    from nerfstudio.engine.callbacks import TrainingCallbackAttributes
-    from nerfstudio.pipelines.base_pipeline import Pipeline
-
     pipeline: Any = owner if isinstance(owner, Pipeline) else pipeline_of(owner)
     attributes = TrainingCallbackAttributes(optimizers, None, pipeline, None)
     with quietly():
@@ -233,8 +214,6 @@ def loss_of(model: Model, rays: RayBundle, batch: dict[str, Tensor], forward: An
 def quietly() -> Iterator[None]:
     """While this lasts, nerfstudio prints nothing: verdicts are what is to be read. Where it ends
     the process, a `RuntimeError` says what it printed last."""
-    from nerfstudio.utils.rich_utils import CONSOLE
-
     printed = CONSOLE.capture()
     try:
         with printed:

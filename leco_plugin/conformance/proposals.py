@@ -202,25 +202,18 @@ def sorted_disjoint_inside(case: ProposalCase) -> None:
 @checks("skips-only-what-it-may", "proposal")
 def skips_only_what_it_may(case: ProposalCase) -> None:
     for training in (False, True):
-        _check_gathered(case, case.shared(SLAB).train(training))
+        _check_gathered(case, case.shared(SLAB).train(training), kit.crossing())
     _check_gathered(case, case.shared(SLAB), kit.within())
     if case.needs_occupancy:
-        _check_gathered(case, _in_other_coordinates(case).eval())
+        try:
+            moved = case.build(SLAB.occupancy(case.gate_encoding, kit.MOVED), frame=kit.MOVED)
+        except TypeError as error:
+            raise Broken(f"no host in other coordinates can have it (frame=): {error}") from error
+        _check_gathered(case, moved.eval(), kit.crossing())
         _check_gathered(case, case.shared(kit.AROUND), kit.leaving(), kit.AROUND)
 
 
-def _in_other_coordinates(case: ProposalCase) -> Any:
-    """The sampler for a host whose coordinates are not those of the occupancy."""
-    try:
-        return case.build(SLAB.occupancy(case.gate_encoding, kit.MOVED), frame=kit.MOVED)
-    except TypeError as error:
-        raise Broken(f"no host in other coordinates can have it (frame=): {error}") from error
-
-
-def _check_gathered(
-    case: ProposalCase, sampler: Any, rays: Rays | None = None, scene: Slab = SLAB
-) -> None:
-    rays = rays or kit.crossing()
+def _check_gathered(case: ProposalCase, sampler: Any, rays: Rays, scene: Slab = SLAB) -> None:
     enters, leaves = chords(rays, scene)
     long = leaves - enters >= CHORD
     ray_indices, t_starts, t_ends = case.sample(sampler, rays)

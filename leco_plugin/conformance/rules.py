@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import torch
+from torch import Tensor
 
 OURS = Path(__file__).resolve().parents[1]
 LIBRARIES = {"torch", "nerfstudio", "nerfacc"}
@@ -30,6 +31,12 @@ def require(holds: bool, problem: str) -> None:
     """Raises `Broken` with `problem` unless the condition holds."""
     if not holds:
         raise Broken(problem)
+
+
+def require_none(wrong: Tensor, problem: str) -> None:
+    """Raises `Broken` if anything of `wrong` [N] is True; the {} of `problem` says how many are."""
+    count = int(wrong.sum())
+    require(count == 0, problem.format(f"{count} of {len(wrong)}"))
 
 
 @contextmanager

@@ -54,20 +54,20 @@ class SamplerCase(Case):
 
     def shared(self, scene: Slab) -> Any:
         """The sampler of a scene, ready for hosts and in evaluation mode."""
-        return self._built(scene)[0].eval()
-
-    def occupancy(self, scene: Slab) -> Occupancy:
-        """The occupancy that `shared(scene)` was given, if it was given one."""
-        return self._built(scene)[1]
-
-    def _built(self, scene: Slab) -> tuple[Any, Occupancy]:
         if scene not in self._shared:
-            occupancy = scene.occupancy(self.gate_encoding)
-            sampler = self.build(occupancy if self.needs_occupancy else None)
+            self._shared[scene] = sampler, _ = self.build_in(scene)
             if not self.needs_occupancy:
                 self.teach(sampler, scene)
-            self._shared[scene] = sampler, occupancy
-        return self._shared[scene]
+        return self._shared[scene][0].eval()
+
+    def occupancy(self, scene: Slab) -> Occupancy:
+        """The occupancy that `shared(scene)` was given, if it needs one."""
+        return self._shared[scene][1]
+
+    def build_in(self, scene: Slab) -> tuple[Any, Occupancy]:
+        """A sampler of a scene, untaught, and the occupancy that it is given if it needs one."""
+        occupancy = scene.occupancy(self.gate_encoding)
+        return self.build(occupancy if self.needs_occupancy else None), occupancy
 
     @abstractmethod
     def build(self, occupancy: Occupancy | None) -> Any:
@@ -172,7 +172,7 @@ def no_gradient_to_the_gate(case: SamplerCase) -> None:
 def state_dict_round_trip(case: SamplerCase) -> None:
     """The checkpoint of one scene turns a sampler of another scene into the first."""
     source, rays = case.shared(kit.EVERYTHING), kit.crossing()
-    restored = case.build(kit.OTHER.occupancy(case.gate_encoding) if case.needs_occupancy else None)
+    restored, _ = case.build_in(kit.OTHER)
     # what is derived at first use is of the other scene
     case.sample(restored.eval(), rays, kit.OTHER)
     restored.load_state_dict(reloaded(source.state_dict()))
@@ -206,29 +206,19 @@ def samples_after_a_step(kind: type[SamplerCase], name: str, rank: int) -> Sampl
     sampler = case.shared(SLAB).train()
     own = Rays(*(tensor[rank::2] for tensor in rays))
     case.colours(sampler, own, Field()).sum().backward()
-    _share(sampler)
-    return case.sample(sampler.eval(), rays, seed=rank)
-
-
-def _share(sampler: nn.Module) -> None:
-    """What data-parallel training does before each step: all ranks take what rank 0 holds."""
+    # as data-parallel training does before each step, all ranks take what rank 0 holds
     for tensor in (*sampler.parameters(), *sampler.buffers()):
         held = tensor.detach().clone(memory_format=torch.contiguous_format)
         torch.distributed.broadcast(held, src=0)
         tensor.detach().copy_(held)
+    return case.sample(sampler.eval(), rays, seed=rank)
 
 
 def on_two_ranks(work: Callable[[int], Any], imports: Sequence[str]) -> list[Any]:
-    """What a function returns on each of two CPU ranks, connected as for data-parallel training.
-
-    Args:
-        work: takes the rank; can be pickled, and returns what `torch.load` reads without unpickling
-            foreign types.
-        imports: modules that it needs and that take time to import.
-
-    Raises:
-        Broken: a rank failed, or the two wait for each other.
-    """
+    """What a function of the rank returns on two CPU ranks, connected as for data-parallel
+    training; `Broken` where one failed, or the two wait for each other. It can be pickled, returns
+    what `torch.load` reads without unpickling foreign types, and needs `imports`, modules that take
+    time to import."""
     method = SERVER if SERVER in processes.get_all_start_methods() else "spawn"
     if method == SERVER:
         processes.set_forkserver_preload(list(imports))  # type: ignore[attr-defined]

@@ -15,6 +15,7 @@ from conformance.proposal_mutants import PROPOSAL_MUTANTS
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.plugins.registry import discover_methods
 
+from leco_plugin.conformance import host_training  # noqa: F401 (registers the checks of hosts)
 from leco_plugin.conformance.cases import RULES, cases_of, check, pairs
 from leco_plugin.conformance.rules import Rule, apply
 from leco_plugin.hosts import seams

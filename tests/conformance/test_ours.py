@@ -8,6 +8,7 @@ import nerfacc
 import pytest
 from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
 
+from leco_plugin.conformance import host_training  # noqa: F401 (registers the checks of hosts)
 from leco_plugin.conformance.cases import (
     RULES,
     cases_of,
