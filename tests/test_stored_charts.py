@@ -319,8 +319,8 @@ def test_every_picture_says_its_finding_in_ten_words() -> None:
         path.stem: json.loads(path.read_text()) for path in (results / "capacity").glob("*.json")
     }
     for name, report in reports.items():
-        titles[name] = choice.title_of(report["representations"])
-        assert report["verdict"] == choice.verdict(report["representations"]), name
+        titles[name], said = choice.answer(report["representations"])
+        assert report["verdict"] == said, name
     titles["growth"] = growth_picture.headline(growth_picture.cities(reports))
     titles["learning"] = learning.headline(json.loads((results / "learning.json").read_text()))
     for name, title in titles.items():

@@ -90,50 +90,37 @@ def grid_that_suffices(rows: Sequence[Row], times: float = TOLERANCE) -> Row | N
     return grid if grid is not None and int(grid["size"]) <= USUAL_GRID else None
 
 
-def title_of(rows: Sequence[Row]) -> str:
-    """What the scene needs, in ten words at most."""
+def answer(rows: Sequence[Row]) -> tuple[str, str]:
+    """What the scene needs: in ten words at most, and in a sentence or two."""
     chosen = choose(rows)
     if _keeps_all(chosen):
-        return "At this loss nothing can be skipped"
+        title = "At this loss nothing can be skipped"
+        said = f"{title}: all keep the whole volume. Let the field learn longer (--learn-steps), or"
+        return title, f"{said} allow a larger --lost-surface-mass; both in a new --out."
+    size, kept = kilobytes(chosen), f"keeps {chosen['kept_volume']:.1%} of the volume"
     if chosen["family"] == "grid":
-        return f"A grid suffices: {_of_cells(chosen).replace('^3', '³')}"
-    also = "; perhaps a grid" if grid_that_suffices(rows, TOLD_APART) else ""
-    if grid := grid_that_suffices(rows):
-        also = f", or {grid['size']}³ cells"
-    return f"A gate of {kilobytes(chosen)} suffices{also}"
-
-
-def verdict(rows: Sequence[Row]) -> str:
-    """What the scene needs, in a sentence or two."""
-    chosen = choose(rows)
-    if _keeps_all(chosen):
-        return (
-            "At this loss nothing can be skipped: all keep the whole volume. Let the field learn "
-            "longer (--learn-steps), or allow a larger --lost-surface-mass; both in a new --out."
-        )
-    kept = f"keeps {chosen['kept_volume']:.1%} of the volume"
-    if chosen["family"] == "grid":
-        said = f"A grid suffices: {_of_cells(chosen)}, {kept}"
+        title = f"A grid suffices: {_of_cells(chosen)}"
+        said = f"{title}, {kept}"
         if gate := best_gate(rows):
             said += f"; the gate that pays most, {kilobytes(gate)}, {gate['kept_volume']:.1%}"
-        return f"{said}."
-    named = f"a {NAMES[chosen['family']]} {kept}"
-    said = f"This scene needs {kilobytes(chosen)}: {named}."
+        return title.replace("^3", "³"), f"{said}."
+    title, named = f"A gate of {size} suffices", f"a {NAMES[chosen['family']]} {kept}"
+    said = f"This scene needs {size}: {named}."
     sizes = [int(row["size"]) for row in rows if row["family"] == "grid"]
-    if not sizes:
-        return said
     if grid := grid_that_suffices(rows):
-        return f"A grid suffices: {_of_cells(grid)}. With {kilobytes(chosen)} {named}, as little."
-    if nearly := grid_that_suffices(rows, TOLD_APART):
-        return (
-            f"{said} A grid of {_of_cells(nearly)}, keeps {nearly['kept_volume']:.1%}: with one "
-            "field the two are not told apart, and a grid may suffice."
-        )
-    if large := smallest_grid(rows, chosen):
+        said = f"A grid suffices: {_of_cells(grid)}. With {size} {named}, as little."
+        title += f", or {grid['size']}³ cells"
+    elif nearly := grid_that_suffices(rows, TOLD_APART):
+        said += f" A grid of {_of_cells(nearly)}, keeps {nearly['kept_volume']:.1%}: with one field"
+        said += " the two are not told apart, and a grid may suffice."
+        title += "; perhaps a grid"
+    elif large := smallest_grid(rows, chosen):
         times = f"{stored_bytes(large) / stored_bytes(chosen):.1f} times as many bytes"
         times += " as an octree" if "octree_bytes" in large else ""
-        return f"{said} A grid that keeps as little takes {large['size']}^3 cells, {times}."
-    return f"{said} No grid up to {max(sizes)}^3 keeps as little."
+        said += f" A grid that keeps as little takes {large['size']}^3 cells, {times}."
+    elif sizes:
+        said += f" No grid up to {max(sizes)}^3 keeps as little."
+    return title, said
 
 
 def _of_cells(grid: Row) -> str:
@@ -162,9 +149,10 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
     lost = [max(row["lost_at_volumes"][volume], LEAST) for row in rows]
     with themed(theme):
         figure = new_figure((11, 5.9), theme.page)
-        figure.text(0.015, 0.975, title_of(rows), va="top", fontsize=17, fontweight="bold")
-        found = verdict(rows).replace("^3", "³")
-        said = "\n".join(textwrap.fill(one, 138) for one in (found, circumstances(results)))
+        title, found = answer(rows)
+        figure.text(0.015, 0.975, title, va="top", fontsize=17, fontweight="bold")
+        lines = found.replace("^3", "³"), circumstances(results)
+        said = "\n".join(textwrap.fill(line, 138) for line in lines)
         figure.text(0.015, 0.9, said, va="top", fontsize=11)
         panels = [figure.add_axes((0.065 + 0.485 * i, 0.2, 0.435, 0.5)) for i in range(2)]
         share = results["lost_surface_mass"]
@@ -232,24 +220,18 @@ LEAST_OF_A_GATE = 1e-6
 """Lost surface mass that is drawn for none at all."""
 
 
-def line_of_original(itself: Rung, measured: bool) -> str:
-    """What the original loses by the bar of smaller gates, if a reference measures it."""
-    if not measured:
-        return "nothing here measures what the original itself loses"
-    return f"the original {_losses(itself)}"
-
-
 def line_of_lowered(itself: Rung, lowered: Mapping[str, float]) -> str:
     """At which threshold the original is shrunk instead, and what it loses there."""
     return (
         f"that leaves too little to a smaller gate: the original's threshold is lowered from "
         f"{lowered['from']:.3g} to {lowered['to']:.3g}, at which it keeps "
         f"{lowered['kept_volume']:.2f} times as much of the volume, counts as all of it below, and "
-        f"{_losses(itself)}"
+        f"{losses_in_words(itself)}"
     )
 
 
-def _losses(itself: Rung) -> str:
+def losses_in_words(itself: Rung) -> str:
+    """What the original loses by the bar of smaller gates."""
     price = "" if itself.image_price_db is None else f", {itself.image_price_db:+.3f} dB"
     lost = f"{itself.lost_surface_mass:.1e} of the surface mass, at most {itself.bound:.1e}"
     outside = "" if itself.verdict == HOLDS else f": it {itself.verdict} by this measure"

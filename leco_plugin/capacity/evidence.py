@@ -7,7 +7,7 @@ rendering that it guides. What a smaller gate loses then comes on top of the ori
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import accumulate
 from typing import NamedTuple
 
@@ -72,23 +72,24 @@ class Loss(NamedTuple):
     """Share of all rendering weight before the backdrop, haze included."""
 
 
+def worst(losses: Iterable[Loss]) -> Loss:
+    """The largest of each figure."""
+    return Loss(*map(max, zip(*losses)))
+
+
 @torch.no_grad()
 def gather(
     mixture: Mixture | None, occupancy: Occupancy | None, seen: Seen
 ) -> tuple[Evidence, list[Rendered]]:
     """The candidates of some rays with their worth, all kept where there is no original; and their
     renderings if there is a model."""
-    pieces, rendered = [], []
-    parts = in_chunks(seen.rays, RAYS_AT_ONCE), seen.truth.split(RAYS_AT_ONCE)
-    for rays, truth in zip(*parts):
-        if mixture is None:
-            assert occupancy is not None
-            pieces.append(_by_decisions(occupancy, rays))
-            continue
-        piece, again = _by_rendering(mixture, occupancy, rays, on_black(truth))
-        pieces.append(piece)
-        rendered.append(again)
-    return join(pieces), rendered
+    chunks, truths = in_chunks(seen.rays, RAYS_AT_ONCE), seen.truth.split(RAYS_AT_ONCE)
+    if mixture is None:
+        assert occupancy is not None
+        return join([_by_decisions(occupancy, rays) for rays in chunks]), []
+    pairs = zip(chunks, map(on_black, truths))
+    pieces, rendered = zip(*(_by_rendering(mixture, occupancy, *pair) for pair in pairs))
+    return join(pieces), [*rendered]
 
 
 def join(pieces: Sequence[Evidence]) -> Evidence:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from leco_plugin.capacity.choice import VOLUMES, choose, draw, kilobytes, verdict
+from leco_plugin.capacity.choice import VOLUMES, answer, choose, draw, kilobytes
 from leco_plugin.capacity.evidence import RAYS_AT_ONCE, Evidence, gather
 from leco_plugin.capacity.search import Candidate, find_threshold, gates, grids
 from leco_plugin.capacity.sources import Source, draw_held_out, draw_training_rays
@@ -30,7 +30,6 @@ from leco_plugin.log import bar, put
 from leco_plugin.models.gate import GateConfig, occupancy_logit
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.mixture import Mixture
-from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.occupancy import Precision, gate_precision
 from leco_plugin.scenes.input_error import InputError, one_line, require_folder
 from leco_plugin.scenes.photographs import describe_scene
@@ -97,14 +96,14 @@ def prepare(data: Path, folder: Path, learn_steps: int) -> Taught:
             f"{stored} cannot be used ({one_line(error, 200)}): name a new folder with --out, or "
             f"delete {stored} and the points beside it"
         ) from None
-    return _render_rays(Source(manager, model.eval()), model)
+    return _render_rays(manager, model.eval())
 
 
-def _render_rays(source: Source, model: LecoModel) -> Taught:
+def _render_rays(manager: Any, model: LecoModel) -> Taught:
     torch.manual_seed(1)  # the same rays also where the field was loaded
     mixture = model.mixture
-    lesson = lesson_of(source, model.config.gate_loss)
-    rays = draw_held_out(source, mixture.occupancy().eval(), RAYS, parts=1)[0]
+    lesson = lesson_of(manager, model)
+    rays = draw_held_out(Source(manager, model), mixture.occupancy().eval(), RAYS, parts=1)[0]
     evidence, _ = gather(mixture, None, rays)
     if not bool(evidence.worth.any()):
         raise InputError(
@@ -116,11 +115,11 @@ def _render_rays(source: Source, model: LecoModel) -> Taught:
     return Taught(mixture, lesson, evidence, mapped, volume)
 
 
-def lesson_of(source: Source, losses: GateLossConfig) -> Lesson:
-    """What a source's field has to teach along rays that it was trained on, nothing skipped."""
-    mixture = source.mixture
-    assert mixture is not None
-    taught = draw_training_rays(source, mixture.occupancy().eval(), TAUGHT_RAYS).rays
+def lesson_of(manager: Any, model: LecoModel) -> Lesson:
+    """What a model's field has to teach along rays that it was trained on, nothing skipped."""
+    mixture, losses = model.mixture, model.config.gate_loss
+    occupancy = mixture.occupancy().eval()
+    taught = draw_training_rays(Source(manager, model), occupancy, TAUGHT_RAYS).rays
     return lesson_from_field(mixture, taught, losses, share=0.0, rays_at_once=RAYS_AT_ONCE)
 
 
@@ -183,9 +182,8 @@ def taught_score(
 
 def _measure_grid(taught: Taught, candidate: Candidate, lost: float) -> dict[str, Any]:
     """What a taught grid keeps and loses, dilated by a cell where it keeps less so."""
-    assert candidate.resolution is not None
     box = equal_loss.mapped_box(taught.mixture)
-    scores = taught_grid(taught.lesson, box, candidate.resolution)
+    scores = taught_grid(taught.lesson, box, int(candidate.size))
     places = taught.mapped, taught.volume, taught.held_out.worth
     both = [
         measure(taught.held_out, of_rays, of_volume, lost) | {"octree_bytes": size}
@@ -206,26 +204,19 @@ DAMAGED = "is damaged; delete it, or name a new folder with --out"
 
 
 def capacity(
-    data: Path,
-    out: Path,
-    resolutions: Sequence[int] = (32, 64, 128, 256, 512),
-    lost_surface_mass: float = 1e-3,
-    learn_steps: int = 200,
+    data: Path, out: Path, resolutions: Sequence[int], lost_surface_mass: float, learn_steps: int
 ) -> dict[str, Any]:
-    """Teaches and measures what is missing in a folder, and draws all of it.
-
-    What is finished stays there whenever this is stopped.
-
-    Args:
-        resolutions: of grids; those that do not fit the memory are left out.
-        lost_surface_mass: at which kept volumes are compared.
-        learn_steps: of the field.
-    Returns:
-        The results, as in `results.json`.
-    Raises:
-        ValueError, OSError: a folder or a size is wrong; nothing was started.
-    """
-    _check_options(resolutions, lost_surface_mass, learn_steps)
+    """Teaches and measures what is missing in a folder, and draws all of it, by the options of
+    `leco capacity`; returns the results, as in `results.json`. What is finished stays there
+    whenever this is stopped. For a wrong folder or size ValueError or OSError, before anything is
+    started."""
+    if not 0.0 < lost_surface_mass < 0.5:
+        raise InputError(f"--lost-surface-mass is {lost_surface_mass}, not between 0 and 0.5")
+    if learn_steps < 1:
+        raise InputError(f"--learn-steps is {learn_steps}; a field is learned in one or more")
+    if any(n < 2 for n in resolutions):
+        fewest = min(resolutions)
+        raise InputError(f"--grids has {fewest}; a grid has 2 cells or more along an axis")
     require_folder(data, "give that of the scene with --data")
     scene, machine, code = describe_scene(data), describe_machine(), describe_code()
     settings = {
@@ -237,7 +228,10 @@ def capacity(
     words = {"scene": f"points of another scene than {data}"}
     holds = "points with another"
     take_folder(out / SETTINGS, {"scene": scene, **settings}, holds, DAMAGED, words)
-    candidates = [*gates(), *_grids_that_fit(resolutions)]
+    too_large = [n for n in sorted(set(resolutions)) if not fits_memory(n**3)]
+    for n in too_large:
+        put(f"a grid of {n}^3 cells does not fit the free memory; it is left out")
+    candidates = [*gates(), *grids(set(resolutions) - set(too_large))]
     taught = prepare(data, out, learn_steps)
     rows = _measure_missing(out, taught, candidates, lost_surface_mass, code)
     results = {
@@ -248,23 +242,12 @@ def capacity(
         "rays": taught.held_out.rays,
         "representations": rows,
         "chosen": dict(choose(rows)),
-        "verdict": verdict(rows),
+        "verdict": answer(rows)[1],
     }
     write_json(out / "results.json", results)
     draw(results, out / "capacity.png", LIGHT)
     draw(results, out / "capacity-dark.png", DARK)
     return results
-
-
-def _check_options(resolutions: Sequence[int], lost_surface_mass: float, learn_steps: int) -> None:
-    if not 0.0 < lost_surface_mass < 0.5:
-        raise InputError(f"--lost-surface-mass is {lost_surface_mass}, not between 0 and 0.5")
-    if learn_steps < 1:
-        raise InputError(f"--learn-steps is {learn_steps}; a field is learned in one or more")
-    if any(n < 2 for n in resolutions):
-        raise InputError(
-            f"--grids has {min(resolutions)}; a grid has 2 cells or more along an axis"
-        )
 
 
 def _measure_missing(
@@ -274,39 +257,25 @@ def _measure_missing(
     lost_surface_mass: float,
     code: dict[str, Any],
 ) -> list[dict[str, Any]]:
-    rows = {one.key: row for one in candidates if (row := _stored(out, one)) is not None}
+    rows: dict[str, dict[str, Any]] = {}
+    files = {one.key: out / POINTS / f"{one.key}.json" for one in candidates}
+    for one in candidates:
+        if (file := files[one.key]).exists():
+            rows[one.key] = read_object(file, DAMAGED)
+            if rows[one.key].get("bytes") != one.bytes:
+                refused = f"{file} is no measured representation"
+                raise InputError(f"{refused}; delete it to measure it again")
     todo = [one for one in candidates if one.key not in rows]
 
     def measure_one(candidate: Candidate, show: Callable[[float], None]) -> str:
         row = measure_candidate(taught, candidate, lost_surface_mass) | made_by(code)
         rows[candidate.key] = row
-        write_json(out / POINTS / f"{candidate.key}.json", row)
+        write_json(files[candidate.key], row)
         return line_of(row)
 
     with bar("Teaching representations") as show:
         make_jobs(todo, measure_one, put, show, done=len(rows))
     return [rows[one.key] for one in candidates]
-
-
-def _grids_that_fit(resolutions: Sequence[int]) -> list[Candidate]:
-    """The grids that fit the memory; says which do not."""
-    found = []
-    for one in grids(tuple(set(resolutions))):
-        if fits_memory(int(one.size) ** 3):
-            found.append(one)
-        else:
-            put(f"a grid of {one.size}^3 cells does not fit the free memory; it is left out")
-    return found
-
-
-def _stored(out: Path, candidate: Candidate) -> dict[str, Any] | None:
-    file = out / POINTS / f"{candidate.key}.json"
-    if not file.exists():
-        return None
-    row = read_object(file, DAMAGED)
-    if row.get("bytes") != candidate.bytes:
-        raise InputError(f"{file} is no measured representation; delete it to measure it again")
-    return row
 
 
 def line_of(row: dict[str, Any]) -> str:

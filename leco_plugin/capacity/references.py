@@ -26,6 +26,7 @@ from leco_plugin.capacity.evidence import (
     join,
     loss,
     unlikely_at,
+    worst,
 )
 from leco_plugin.capacity.sources import Seen, Source, draw_other_pixels, move_between_cameras
 from leco_plugin.models.mixture import Mixture
@@ -103,13 +104,12 @@ class Ground(NamedTuple):
             found.append(one.loss_of(part, skipped, unlikely))
         return found
 
-    def price(self, gate: Occupancy, side: str, absolute: bool = False) -> float | None:
-        """The worst image price of a gate by any reference, dB; if `absolute`, only by those that
-        measure the original itself. None where nothing is rendered."""
+    def price(self, gate: Occupancy, side: str) -> float | None:
+        """The worst image price of a gate by any reference, dB; None where nothing is rendered."""
         prices = []
         for one in self.references:
             part: Part = getattr(one, side)
-            if one.mixture is None or not part.rendered or (absolute and one.guided):
+            if one.mixture is None or not part.rendered:
                 continue
             guides = gate is self.original and one.guided
             beyond = 0.0 if guides else image_price(one.mixture, part.rendered, gate)
@@ -259,15 +259,12 @@ def verify(ground: Ground, smaller: Occupancy, bounds: Bounds, rung: Rung, look:
 
 def measure_original(ground: Ground, bounds: Bounds) -> Rung:
     """The original by the bar of smaller gates, on the rays of the search; nothing is taught."""
-    found = ground.losses(ground.original, "search", unlikely_at(1))
-    price = ground.price(ground.original, "search")
-    bound, params = max(one.bound for one in found), ground.original.num_params
+    lost = worst(ground.losses(ground.original, "search", unlikely_at(1)))
+    price, params = ground.price(ground.original, "search"), ground.original.num_params
     verdict = HOLDS
-    if not bounds.allow(bound, None):
+    if not bounds.allow(lost.bound, None):
         verdict = "is not within the bounds"
-    elif not bounds.allow(bound, price):
+    elif not bounds.allow(lost.bound, price):
         verdict = "costs more of the image than the bounds allow"
-    lost = max(one.share for one in found)
-    return Rung(
-        "the original", params, 2 * params, 1.0, lost, price, verdict, seconds=0.0, bound=bound
-    )
+    sizes = params, 2 * params, 1.0
+    return Rung("the original", *sizes, lost.share, price, verdict, 0.0, bound=lost.bound)

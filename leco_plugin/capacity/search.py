@@ -7,44 +7,48 @@ is found on rays of its own; what is declared is measured on others.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from leco_plugin.capacity.evidence import Evidence, Loss, unlikely_at
+from leco_plugin.capacity.evidence import Evidence, Loss, unlikely_at, worst
 from leco_plugin.capacity.references import Bounds, Ground, Reference, Rung, verify
 from leco_plugin.evaluation.clock import seconds_now
 from leco_plugin.evaluation.field_grids import in_parts
 from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.learning.calibration import thresholds_below
 from leco_plugin.learning.sharpening import Lesson, teach
-from leco_plugin.models.encodings import EncodingConfig
+from leco_plugin.models.encodings import EncodingConfig, Kind
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
 
-FREQUENCY_SIZES = ((3, 8, 1), (4, 16, 1), (5, 16, 2), (6, 32, 2), (8, 64, 2), (6, 64, 3))
-"""Octaves, width and layers of the gates that `leco capacity` compares."""
-HASH_SIZES = ((4, 8, 64), (4, 10, 128), (6, 12, 256), (8, 14, 512), (8, 16, 1024))
-"""Levels, binary logarithm of the entries of each, and cells of the finest along an axis."""
-PRODUCT_SIZES = ((16, 2), (32, 4), (64, 8), (128, 8))
-"""Cells along an axis, and components."""
-PLANE_SIZES = ((16, 2, 1), (32, 2, 1), (32, 4, 1), (64, 4, 2), (128, 2, 4))
-"""Cells along an axis, features and levels."""
+SIZES: dict[Kind, tuple[tuple[int, ...], ...]] = {
+    "frequency": ((3, 8, 1), (4, 16, 1), (5, 16, 2), (6, 32, 2), (8, 64, 2), (6, 64, 3)),
+    "hash": ((4, 8, 64), (4, 10, 128), (6, 12, 256), (8, 14, 512), (8, 16, 1024)),
+    "vm": ((16, 2), (32, 4), (64, 8), (128, 8)),
+    "k-planes": ((16, 2, 1), (32, 2, 1), (32, 4, 1), (64, 4, 2), (128, 2, 4)),
+}
+"""Of the gates that `leco capacity` compares: octaves, width and layers, or `FIELDS`."""
+FIELDS: dict[Kind, tuple[str, ...]] = {
+    "hash": ("levels", "log2_table", "finest"),
+    "vm": ("plane_cells", "components"),
+    "k-planes": ("plane_cells", "features", "levels"),
+}
+"""Of an encoding's config, that its sizes stand for."""
 FREQUENCY = (
     *((3, 8, 1), (4, 8, 1), (4, 16, 1), (4, 16, 2), (5, 16, 2), (6, 16, 2), (6, 24, 2)),
     *((6, 32, 2), (6, 32, 3), (6, 48, 3), (6, 64, 3), (8, 64, 3), (8, 96, 3), (8, 128, 4)),
 )
-"""Octaves, width and layers of the ladder's gates on frequencies."""
+HASH_TABLES = (6, 7, 8)
+PLANES = ((16, 2), (32, 2), (64, 2), (64, 4), (128, 4))
+"""Of the ladder's gates: on frequencies; binary logarithms of the entries a level of hash grids;
+cells, and features or components, of K-planes and TensoRF's products."""
 ENOUGH_OCTAVES = 5
 """From so many on, a gate without a norm decides as well as one with it, and answers sooner."""
-HASH_TABLES = (6, 7, 8)
-"""Binary logarithms of the entries a level of the ladder's gates on hash grids."""
-PLANES = ((16, 2), (32, 2), (64, 2), (64, 4), (128, 4))
-"""Cells, and features or components, of the ladder's gates on K-planes and TensoRF's products."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +57,9 @@ class Candidate:
 
     family: str
     size: str
+    """Of a grid, its cells along an axis."""
     gate: GateConfig | None = None
-    resolution: int | None = None
+    """None for a grid."""
 
     @property
     def key(self) -> str:
@@ -66,57 +71,46 @@ class Candidate:
         """A gate's numbers in bfloat16, a grid's cells in bits."""
         if self.gate is not None:
             return 2 * values_of(self.gate)
-        assert self.resolution is not None
-        return math.ceil(self.resolution**3 / 8)
+        return math.ceil(int(self.size) ** 3 / 8)
 
 
 def gates() -> list[Candidate]:
     """Gates of growing size of each kind, for `leco capacity`."""
     found = []
-    for octaves, width, layers in FREQUENCY_SIZES:
-        gate = GateConfig(EncodingConfig(octaves=octaves), width, layers, 1)
-        found.append(Candidate("frequency", f"{octaves}-{width}-{layers}", gate))
-    for levels, table, finest in HASH_SIZES:
-        encoding = EncodingConfig("hash", levels=levels, log2_table=table, finest=finest)
-        found.append(Candidate("hash", f"{levels}-{table}", GateConfig(encoding, 16, 1, 1)))
-    for cells, components in PRODUCT_SIZES:
-        encoding = EncodingConfig("vm", components=components, plane_cells=cells)
-        found.append(Candidate("vm", f"{cells}-{components}", GateConfig(encoding, 16, 1, 1)))
-    for cells, features, levels in PLANE_SIZES:
-        gate = _on_planes(cells, features, levels)
-        found.append(Candidate("k-planes", f"{cells}-{features}-{levels}", gate))
+    for kind, sizes_of_kind in SIZES.items():
+        for sizes in sizes_of_kind:
+            named = sizes[:2] if kind == "hash" else sizes
+            found.append(Candidate(kind, "-".join(map(str, named)), gate_of(kind, *sizes)))
     return found
 
 
-def grids(resolutions: tuple[int, ...]) -> list[Candidate]:
-    return [Candidate("grid", str(n), resolution=n) for n in sorted(resolutions)]
+def grids(resolutions: Iterable[int]) -> list[Candidate]:
+    return [Candidate("grid", str(n)) for n in sorted(resolutions)]
 
 
 def ladder(most_values: int) -> list[GateConfig]:
     """The gates that `leco shrink` tries, by size: all that have fewer values than given. They have
     one scene expert, for o(x) is all that is asked of an occupancy."""
     found = [
-        GateConfig(EncodingConfig(octaves=octaves), width, layers, 1, octaves < ENOUGH_OCTAVES)
-        for octaves, width, layers in FREQUENCY
+        replace(gate_of("frequency", *sizes), normed=sizes[0] < ENOUGH_OCTAVES)
+        for sizes in FREQUENCY
     ]
-    for table in HASH_TABLES:
-        grid = EncodingConfig("hash", levels=4, log2_table=table, finest=64)
-        found.append(GateConfig(grid, 16, 1, 1))
-    for cells, features in PLANES:
-        sizes: Any = {"components": features, "plane_cells": cells, "levels": 1, "coarsest": cells}
-        products = GateConfig(EncodingConfig("vm", **sizes), 16, 1, 1)
-        found += [_on_planes(cells, features, 1), products]
+    found += [gate_of("hash", 4, table, 64) for table in HASH_TABLES]
+    for sizes in PLANES:
+        found += [gate_of("k-planes", *sizes, 1), gate_of("vm", *sizes)]
     counted = sorted((values_of(gate), i) for i, gate in enumerate(found))
     return [found[i] for values, i in counted if values < most_values]
 
 
-def _on_planes(cells: int, features: int, levels: int) -> GateConfig:
-    """A gate on K-planes: one level of `cells` along an axis, or several from 16 up to that."""
-    coarsest = 16 if levels > 1 else cells
-    encoding = EncodingConfig(
-        "k-planes", levels=levels, features=features, coarsest=coarsest, plane_cells=cells
-    )
-    return GateConfig(encoding, 16, 1, 1)
+def gate_of(kind: Kind, *sizes: int) -> GateConfig:
+    """A gate with one scene expert, by its sizes, as `SIZES` has them."""
+    if kind == "frequency":
+        octaves, width, layers = sizes
+        return GateConfig(EncodingConfig(octaves=octaves), width, layers, 1)
+    named: dict[str, Any] = dict(zip(FIELDS[kind], sizes, strict=True))
+    if named.get("levels") == 1:
+        named["coarsest"] = named["plane_cells"]
+    return GateConfig(EncodingConfig(kind, **named), 16, 1, 1)
 
 
 def values_of(config: GateConfig) -> int:
@@ -165,13 +159,9 @@ def search(
     on_rung: Callable[[Rung], None] = lambda rung: None,
     on_progress: Callable[[float], None] = lambda share: None,
 ) -> Found:
-    """Walks up the ladder and stops at the first gate that is within the bounds on unseen rays.
-
-    Args:
-        gates: by size; those smaller than the original by default.
-        on_rung: called with each gate that was tried.
-        on_progress: called with the share of the ladder that is done.
-    """
+    """Walks up the ladder, `gates` by size or all that are smaller than the original, and stops at
+    the first that is within the bounds on unseen rays. `on_rung` gets each gate that was tried,
+    `on_progress` the share of the ladder that is done."""
     gates = ladder(values_of(ground.original.gate.config)) if gates is None else gates
     volume = spread_positions(ground.original, VOLUME_POINTS, seed=5)
     kept = kept_of_box(ground.original)
@@ -295,17 +285,16 @@ def lower_threshold(ground: Ground, bounds: Bounds) -> Occupancy | None:
     or nothing measures it.
     """
     original = ground.original
-    absolute = [reference for reference in ground.references if not reference.guided]
-    losses_at = _losses_of(original, absolute)
+    absolute = ground._replace(references=[one for one in ground.references if not one.guided])
+    losses_at = _losses_of(original, absolute.references)
 
     def meets(there: Occupancy) -> bool:
-        losses = losses_at(there.threshold, 1)
-        share, bound = max(one.share for one in losses), max(one.bound for one in losses)
-        if share > MARGIN * bounds.lost_surface_mass or not bounds.allow(bound, None):
+        lost = worst(losses_at(there.threshold, 1))
+        if lost.share > MARGIN * bounds.lost_surface_mass or not bounds.allow(lost.bound, None):
             return False  # before anything is rendered
-        return bounds.allow(bound, ground.price(there, "search", absolute=True))
+        return bounds.allow(lost.bound, absolute.price(there, "search"))
 
-    if not absolute or meets(original):
+    if not absolute.references or meets(original):
         return None
     lower = map(original.with_threshold, thresholds_below(original.threshold))
     return next(filter(meets, lower), None)

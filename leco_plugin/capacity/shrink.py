@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import random
 import statistics
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -14,12 +13,12 @@ from typing import Any
 import torch
 
 from leco_plugin.capacity import references, sources
-from leco_plugin.capacity.choice import line_of, line_of_lowered, line_of_original
+from leco_plugin.capacity.choice import line_of, line_of_lowered, losses_in_words
 from leco_plugin.capacity.evidence import gather
 from leco_plugin.capacity.references import HOLDS, LOST_DECISIONS, Bounds, Ground, Rung
 from leco_plugin.capacity.search import Found, kept_of_box, lower_threshold, search
 from leco_plugin.capacity.sources import Seen, Source
-from leco_plugin.evaluation.clock import synchronize
+from leco_plugin.evaluation.clock import Clock
 from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.evaluation.report import describe_code, describe_machine, made_by
 from leco_plugin.learning.freezing import HARDLY_ANYTHING
@@ -44,22 +43,25 @@ def shrink(
     data: Path,
     out: Path,
     bounds: Bounds,
-    keep: Callable[[dict[str, Any]], None] = lambda results: None,
+    keep: Callable[[dict[str, Any]], None],
 ) -> dict[str, Any]:
-    """Finds the smallest gate that decides as a frozen one does, and writes it.
+    """Finds the smallest gate that decides as a frozen one does, and writes it, by the options of
+    `leco shrink`; returns the gates that were tried, and what was written: JSON values.
 
-    Args:
-        file: an occupancy, in the folder of its run if its trained model is to be the reference.
-        out: file of the smaller occupancy.
-        bounds: what it may declare.
-        keep: called with the results so far, JSON values, after each gate that was tried.
-    Returns:
-        The gates that were tried, and what was written: JSON values.
-    Raises:
-        ValueError, OSError: a file, a folder or a bound is wrong; nothing was written.
+    After each gate `keep` gets the results so far. For a wrong file, folder or bound ValueError or
+    OSError, before anything is written.
     """
     code = describe_code()
-    source, original = _open(file, data, out, bounds)
+    check_place("--out", out)
+    check_apart({"--out": out}, file)
+    original = Occupancy.load(file)
+    _check_original(original, file, bounds)
+    random.seed(0)  # nerfstudio caches images in an order of its own
+    torch.manual_seed(0)
+    source = sources.find_source(file, data)
+    sources.check_scene(source, original, data)
+    check_losses(source, original, file, bounds)
+    original = original.to(source.manager.device)
     ground, itself, lowered = _meet_bounds(source, original, file, bounds)
     results: dict[str, Any] = {
         "format": 1,
@@ -77,10 +79,10 @@ def shrink(
         results["rungs"].append(asdict(rung))
         keep(results)
 
-    found, smaller = _find_smaller(ground, bounds, itself, tell)
+    smaller, rung = _find_smaller(ground, bounds, itself, tell)
     checked = _check_on_test_photographs(source, ground.original, smaller)
     is_untrained = held_out_sampler(source.manager) is not None
-    smaller.report = _report_of(ground, found, itself, is_untrained, lowered, checked)
+    smaller.report = _report_of(ground, smaller, rung, is_untrained, lowered, checked)
     out.parent.mkdir(parents=True, exist_ok=True)
     smaller.save(out)
     speedup, times = compare_queries(ground.original, smaller)
@@ -95,19 +97,6 @@ def shrink(
     }
 
 
-def _open(file: Path, data: Path, out: Path, bounds: Bounds) -> tuple[Source, Occupancy]:
-    check_place("--out", out)
-    check_apart({"--out": out}, file)
-    original = Occupancy.load(file)
-    _check_original(original, file, bounds)
-    random.seed(0)  # nerfstudio caches images in an order of its own
-    torch.manual_seed(0)
-    source = sources.find_source(file, data)
-    sources.check_scene(source, original, data)
-    check_losses(source, original, file, bounds)
-    return source, original.to(source.manager.device)
-
-
 def _meet_bounds(
     source: Source, original: Occupancy, file: Path, bounds: Bounds
 ) -> tuple[Ground, Rung, dict[str, float] | None]:
@@ -116,7 +105,10 @@ def _meet_bounds(
     drawn = draw_rays(source, original)
     ground = prepare(source, original, *drawn)
     itself = references.measure_original(ground, bounds)
-    put(line_of_original(itself, ground.measures_original))
+    if ground.measures_original:
+        put(f"the original {losses_in_words(itself)}")
+    else:
+        put("nothing here measures what the original itself loses")
     lower = lower_threshold(ground, bounds)
     if lower is None:
         if itself.verdict != HOLDS:
@@ -138,8 +130,8 @@ def _meet_bounds(
 
 def _find_smaller(
     ground: Ground, bounds: Bounds, itself: Rung, tell: Callable[[Rung], None]
-) -> tuple[Found, Occupancy]:
-    """The gates that were tried, and what is stored: the original again where none of them holds.
+) -> tuple[Occupancy, Rung]:
+    """What is stored, and its rung: the original again where no smaller gate holds.
 
     Its weights are rounded where autocast rounds them anyway: not a decision changes. Where a
     reference measures it, `itself` gets what is to be declared.
@@ -149,13 +141,13 @@ def _find_smaller(
         with bar("Teaching smaller gates") as show:
             found = search(ground, bounds, on_rung=tell, on_progress=show)
     if found.occupancy is not None:
-        return found, found.occupancy
+        return found.occupancy, found.rungs[-1]
     if ground.measures_original:
         looks = max((rung.look or 0 for rung in found.rungs), default=0)
         references.verify(ground, original, bounds, itself, looks + 1)
     if original.precision == "bfloat16":
         round_weights(original.gate.hidden)
-    return found, original
+    return original, itself
 
 
 def draw_rays(source: Source, original: Occupancy) -> tuple[Sequence[tuple[Seen, Seen]], Seen]:
@@ -253,8 +245,8 @@ def _check_on_test_photographs(
 
 def _report_of(
     ground: Ground,
-    found: Found,
-    itself: Rung,
+    smaller: Occupancy,
+    rung: Rung,
     is_untrained: bool,
     lowered: Mapping[str, float] | None,
     checked: Mapping[str, Any] | None,
@@ -265,7 +257,6 @@ def _report_of(
     what holds without them stays beside it.
 
     Args:
-        itself: the original, which is stored again where nothing smaller holds.
         is_untrained: whether nothing was trained on the pixels of the ground's rays.
         lowered: how far the original's threshold was lowered.
     """
@@ -273,15 +264,13 @@ def _report_of(
     report = {name: original.report[name] for name in COPIED if name in original.report}
     if "cameras" in report:
         report["cameras"] = [[round(float(x), 4) for x in row] for row in report["cameras"]]
-    rung = itself
-    if found.occupancy is None:
+    if smaller is original:
         report = {**original.report, **report, "threshold": original.threshold}
     else:
-        rung = found.rungs[-1]
         more = 1.0 if lowered is None else lowered["kept_volume"]
         report |= {
             "params": rung.params,
-            "threshold": found.occupancy.threshold,
+            "threshold": smaller.threshold,
             "kept_candidates_dropped": rung.verified["kept_candidates_dropped"],
             "shrunk_from_params": original.num_params,
             "kept_volume_of_the_original": round(more * rung.kept_volume, 4),
@@ -322,11 +311,10 @@ def compare_queries(original: Occupancy, smaller: Occupancy) -> tuple[float, lis
     positions = whole_box(original).draw(TIMED_POSITIONS).to(original.threshold_value.device)
 
     def seconds(occupancy: Occupancy) -> float:
-        synchronize()
-        started = time.perf_counter()
-        occupancy.occupied(positions)
-        synchronize()
-        return time.perf_counter() - started
+        clock = Clock()
+        with clock.running():
+            occupancy.occupied(positions)
+        return clock.seconds
 
     pairs = [(seconds(original), seconds(smaller)) for _ in range(TIMED_ROUNDS)][2:]
     ratio = statistics.median(before / after for before, after in pairs)

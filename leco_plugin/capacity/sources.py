@@ -155,22 +155,19 @@ def draw_other_pixels(
 ) -> Seen:
     """Rays of different training pixels, none of them of the rays `besides`; fewer than `count`
     where the photographs have hardly more pixels."""
-    known = [_numbers(seen.pixels) for seen in besides if seen.pixels is not None]
-    taken = np.concatenate([np.empty(0, np.int64), *known])
-    pieces: list[tuple[Tensor, Tensor]] = []
+    taken = [_numbers(seen.pixels) for seen in besides if seen.pixels is not None]
+    pixels, truths = [], []
     for _ in range(DRAWS):
         batch = _draw(source, count)[1]
         numbers = _numbers(batch["indices"])
-        new = np.zeros(len(numbers), bool)
-        new[np.unique(numbers, return_index=True)[1]] = True
-        new &= ~np.isin(numbers, taken)
-        taken = np.concatenate([taken, numbers[new]])
-        chosen = torch.from_numpy(new)
-        pieces.append((batch["indices"].cpu()[chosen], batch["image"].cpu()[chosen]))
-        if sum(len(pixels) for pixels, _ in pieces) >= count:
+        first = np.sort(np.unique(numbers, return_index=True)[1])
+        new = first[~np.isin(numbers[first], np.concatenate([np.empty(0, np.int64), *taken]))]
+        taken.append(numbers[new])
+        pixels.append(batch["indices"].cpu()[new])
+        truths.append(batch["image"].cpu()[new])
+        if sum(map(len, pixels)) >= count:
             break
-    pixels, truth = (torch.cat(parts)[:count] for parts in zip(*pieces))
-    return _see_pixels(source, occupancy, pixels, truth)
+    return _see_pixels(source, occupancy, torch.cat(pixels)[:count], torch.cat(truths)[:count])
 
 
 def move_between_cameras(source: Source, seen: Seen, seed: int) -> Seen:

@@ -143,7 +143,6 @@ def compare_at_freezing(model: Any, datamanager: Any, contender: Contender) -> d
         return at_equal_loss(model.mixture, datamanager, contender.grids)
     from leco_plugin.capacity.measuring import lesson_of, taught_grid, taught_score
     from leco_plugin.capacity.search import gates
-    from leco_plugin.capacity.sources import Source
     from leco_plugin.chart.representations import SPARSE
     from leco_plugin.evaluation.clock import Clock
     from leco_plugin.learning.dense import evaluating
@@ -152,7 +151,7 @@ def compare_at_freezing(model: Any, datamanager: Any, contender: Contender) -> d
     known = {gate.key: gate for gate in gates()}
     clock = Clock()
     with clock.running(), evaluating(model):
-        lesson = lesson_of(Source(datamanager, model), model.config.gate_loss)
+        lesson = lesson_of(datamanager, model)
     of_lesson = clock.seconds
     scores: dict[str, Any] = {}
     rows: dict[str, list[dict[str, Any]]] = {"taught": [], "others": []}

@@ -10,6 +10,7 @@ import pytest
 from leco_plugin.capacity.choice import (
     TOLD_APART,
     WORTH_TEN_TIMES,
+    answer,
     best_gate,
     choose,
     circumstances,
@@ -19,8 +20,6 @@ from leco_plugin.capacity.choice import (
     kilobytes,
     smallest_grid,
     stored_bytes,
-    title_of,
-    verdict,
 )
 from leco_plugin.capacity.measuring import VOLUMES
 
@@ -50,7 +49,7 @@ def test_what_the_scene_needs_is_said_beside_the_grid_that_keeps_as_little() -> 
     rows = [LARGE_GATE, SMALL_GATE, COARSE, FINE]
     assert choose(rows) is SMALL_GATE
     assert smallest_grid(rows, SMALL_GATE) is FINE and grid_that_suffices(rows) is None
-    said = verdict(rows)
+    said = answer(rows)[1]
     assert said.startswith("This scene needs 3.0 kB: a gate on frequencies keeps 6.2%")
     assert "256^3 cells, 699.1 times" in said
 
@@ -59,7 +58,7 @@ def test_a_grid_that_suffices_is_named() -> None:
     enough = row("grid", "16", 512, 0.061)
     rows = [SMALL_GATE, LARGE_GATE, enough, FINE]
     assert choose(rows) is grid_that_suffices(rows) is enough
-    assert verdict(rows).startswith("A grid suffices: 16^3 cells")
+    assert answer(rows)[1].startswith("A grid suffices: 16^3 cells")
 
 
 def test_a_grid_has_the_bytes_of_its_octree_where_they_are_known() -> None:
@@ -67,7 +66,7 @@ def test_a_grid_has_the_bytes_of_its_octree_where_they_are_known() -> None:
     rows = [SMALL_GATE, LARGE_GATE, small]
     assert choose([SMALL_GATE, small | {"octree_bytes": 3_000}]) is SMALL_GATE
     assert choose(rows) is small and best_gate(rows) is SMALL_GATE
-    assert verdict(rows) == (
+    assert answer(rows)[1] == (
         "A grid suffices: 64^3 cells, 0.8 kB as an octree, keeps 7.5% of the volume; the gate "
         "that pays most, 3.0 kB, 6.2%."
     )
@@ -79,23 +78,23 @@ def test_a_usual_grid_that_keeps_as_little_as_a_smaller_gate_suffices() -> None:
     usual = row("grid", "128", 262_144, 0.064)
     rows = [SMALL_GATE, COARSE, usual, FINE]
     assert choose(rows) is SMALL_GATE and grid_that_suffices(rows) is usual
-    said = verdict(rows)
+    title, said = answer(rows)
     assert said.startswith("A grid suffices: 128^3 cells, 262.1 kB.") and "With 3.0 kB" in said
-    assert title_of(rows) == "A gate of 3.0 kB suffices, or 128³ cells"
+    assert title == "A gate of 3.0 kB suffices, or 128³ cells"
 
 
 def test_a_grid_that_keeps_hardly_more_is_not_called_worse() -> None:
     """One field and one seed do not tell them apart."""
     hardly, more = (row("grid", "32", 4_096, factor * 0.062) for factor in (1.15, 1.25))
     assert grid_that_suffices([SMALL_GATE, hardly], TOLD_APART) is hardly
-    assert "4.1 kB, keeps 7.1%: with one field" in verdict([SMALL_GATE, hardly])
+    assert "4.1 kB, keeps 7.1%: with one field" in answer([SMALL_GATE, hardly])[1]
     assert grid_that_suffices([SMALL_GATE, more], TOLD_APART) is None
     assert grid_that_suffices([SMALL_GATE, FINE], TOLD_APART) is None  # no usual one
 
 
 def test_grids_that_never_keep_as_little_are_named() -> None:
-    assert "No grid up to 32^3" in verdict([SMALL_GATE, COARSE])
-    assert "grid" not in verdict([SMALL_GATE])
+    assert "No grid up to 32^3" in answer([SMALL_GATE, COARSE])[1]
+    assert "grid" not in answer([SMALL_GATE])[1]
 
 
 def test_losses_are_compared_at_about_the_volume_of_the_chosen_one() -> None:
@@ -120,9 +119,10 @@ def test_a_scene_where_everything_keeps_all_is_drawn(tmp_path: Path) -> None:
 
 def test_what_skips_nothing_is_not_said_to_suffice() -> None:
     full = [one | {"kept_volume": 1.0} for one in (SMALL_GATE, LARGE_GATE, COARSE)]
-    assert title_of(full) == "At this loss nothing can be skipped"
-    assert verdict(full).startswith(title_of(full)) and "--learn-steps" in verdict(full)
-    assert "suffices" in title_of([*full, FINE])
+    title, said = answer(full)
+    assert title == "At this loss nothing can be skipped"
+    assert said.startswith(title) and "--learn-steps" in said
+    assert "suffices" in answer([*full, FINE])[0]
 
 
 def test_a_volume_to_compare_at_is_found_where_next_to_nothing_is_kept() -> None:
