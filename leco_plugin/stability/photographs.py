@@ -39,6 +39,7 @@ from leco_plugin.stability.scene import (
     Paint,
     Pane,
     Rod,
+    Seen,
     Shape,
     Stage,
     photograph,
@@ -301,21 +302,19 @@ def digest_of(stage: Stage, capture: Capture) -> str:
 
 def _take_pictures(stage: Stage, capture: Capture, folder: Path) -> None:
     """Writes pictures, truth, sparse points and transforms."""
-    shots = shots_of(capture)
-    taken = []
-    for number, shot in enumerate(shots):
+    taken: list[tuple[Shot, Seen, View]] = []
+    for number, shot in enumerate(shots_of(capture)):
         there = stage
         if shot.moving:  # a car, never twice in the same place
             x = -3.0 + (1.7 * number) % 6.0
             car = Box((x - 0.5, -0.35, 0.0), (x + 0.5, 0.25, 0.55), CAR)
             there = replace(stage, shapes=(*stage.shapes, car))
-        taken.append(photograph(there, shot.pose, capture.lens(shot.size)))
-    views = [
-        View(shot.pose, capture.lens(shot.size), seen.depth) for shot, seen in zip(shots, taken)
-    ]
-    trained = [view for shot, view in zip(shots, views) if not shot.held_out]
+        lens = capture.lens(shot.size)
+        seen = photograph(there, shot.pose, lens)
+        taken.append((shot, seen, View(shot.pose, lens, seen.depth)))
+    trained = [view for shot, _, view in taken if not shot.held_out]
     clouds, frames = [], []
-    for number, (shot, seen, view) in enumerate(zip(shots, taken, views)):
+    for number, (shot, seen, view) in enumerate(taken):
         light = seen.image[..., :3].astype(float) * shot.gain
         image = np.dstack([np.rint(light.clip(0, 255)).astype(np.uint8), seen.image[..., 3]])
         Image.fromarray(image).save(folder / shot.file)
@@ -334,13 +333,13 @@ def _take_pictures(stage: Stage, capture: Capture, folder: Path) -> None:
     places, colours = map(np.concatenate, zip(*clouds))
     if len(places):
         write_points(folder / POINTS, places, colours)
-    held_out = [shot.file for shot in shots if shot.held_out]
+    held_out = [shot.file for shot, _, _ in taken if shot.held_out]
     transforms = {
         "camera_model": "OPENCV",
         "orientation_override": "none",
         **({"ply_file_path": POINTS} if len(places) else {}),
         "frames": frames,
-        "train_filenames": [shot.file for shot in shots if not shot.held_out],
+        "train_filenames": [shot.file for shot, _, _ in taken if not shot.held_out],
         "val_filenames": held_out,
         "test_filenames": held_out,
     }

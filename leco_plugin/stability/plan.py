@@ -107,38 +107,29 @@ def with_references(names: set[str]) -> list[Sampler]:
     return [one for one in SAMPLERS.values() if one.name in names | references]
 
 
-def contender_of(
-    sampler: Sampler,
-    sizes: Sizes,
-    changes: Mapping[str, Any],
-    settings: Mapping[str, Any],
-    grid_levels: int = 1,
-) -> Contender:
+def contender_of(sampler: Sampler, sizes: Sizes, case: Case) -> Contender:
     """The sampler in its host under the conditions of a case. Changes of the model that are about
     learning are left out where nothing is learned."""
     name = sampler.name
     in_nerfacto = name in (PROPOSALS, DENSE_PROPOSAL)
-    own: dict[str, Any] = {"occupancy.sampler": name}
     if name == LEARNED:
-        own = {
-            "occupancy.sampler": "learned-occupancy",
-            "occupancy.rays": sizes.learn_rays,
-            "occupancy.learning.schedule.learn_steps": sizes.learn_steps,
-        }
+        learning = {"rays": sizes.learn_rays, "learning.schedule.learn_steps": sizes.learn_steps}
+        own: dict[str, Any] = {"sampler": "learned-occupancy", **learning}
     elif name == PROPOSALS:
-        own = {"occupancy.sampler": OWN_SAMPLER}
+        own = {"sampler": OWN_SAMPLER}
     elif name == DENSE_PROPOSAL:
-        own["occupancy.options"] = {"samples": sizes.dense_samples}
+        own = {"sampler": name, "options": {"samples": sizes.dense_samples}}
     elif name == DENSE:
-        own["occupancy.options"] = {"levels": DENSE_LEVELS}
+        own = {"sampler": name, "options": {"levels": DENSE_LEVELS}}
     else:
-        options = {"resolution": int(name.removeprefix(f"{GRID}-")), "levels": grid_levels}
-        own = {"occupancy.sampler": "occupancy-grid", "occupancy.options": options}
+        cells = {"resolution": int(name.removeprefix(f"{GRID}-")), "levels": case.grid_levels}
+        own = {"sampler": "occupancy-grid", "options": cells}
+    changes = sizes.host(in_nerfacto) | {f"occupancy.{path}": one for path, one in own.items()}
     left_out = () if name == LEARNED else ("occupancy.",)
-    asked = {path: value for path, value in changes.items() if not path.startswith(left_out)}
+    changes |= {path: one for path, one in case.changes.items() if not path.startswith(left_out)}
     host = "leco-nerfacto" if in_nerfacto else "leco-ngp"
-    changes = {**sizes.host(in_nerfacto), **own, **asked}
-    return Contender(sampler.title, host, name, changes, settings={RAYS: sizes.rays, **settings})
+    settings = {RAYS: sizes.rays, **case.settings}
+    return Contender(sampler.title, host, name, changes, settings=settings)
 
 
 A_RUN = 120.0
@@ -184,29 +175,23 @@ def entries_of(
 ) -> list[Entry]:
     """All cells, case by case, with the references that they are held against.
 
-    Args:
-        seeds: of each cell. Learned occupancy has more where a case is about seeds.
-        beside: seeds of the samplers that learned occupancy is compared with, some of `seeds`; none
-            is `seeds`.
-    Raises:
-        InputError: a seed of `beside` is none of `seeds`, so that nothing is compared with it.
+    Learned occupancy has more than `seeds` where a case is about seeds; what it is compared with
+    has those of `beside`, if any. One of them that is none of `seeds` is an InputError: nothing
+    would be compared with it.
     """
     if alone := [seed for seed in dict.fromkeys(beside) if seed not in seeds]:
         raise InputError(f"--seeds-beside {alone[0]} is none of --seeds: add it there")
     entries = []
     for case in cases:
         wanted = with_references({one.name for one in samplers if case.is_about(one.name)})
-        for sampler in samplers:
-            if sampler in wanted:
-                levels = case.grid_levels
-                one = contender_of(sampler, sizes, case.changes, case.settings, levels)
-                chosen = tuple(dict.fromkeys(seeds))
-                if sampler.name == LEARNED:
-                    more = [seed for seed in range(case.seeds) if seed not in chosen]
-                    chosen += tuple(more[: max(case.seeds - len(chosen), 0)])
-                elif beside and sampler.name != DENSE:
-                    chosen = tuple(dict.fromkeys(beside))
-                entries.append(Entry(case, sampler, one, chosen))
+        for sampler in (one for one in samplers if one in wanted):
+            chosen = tuple(dict.fromkeys(seeds))
+            if sampler.name == LEARNED:
+                more = [seed for seed in range(case.seeds) if seed not in chosen]
+                chosen += tuple(more[: max(case.seeds - len(chosen), 0)])
+            elif beside and sampler.name != DENSE:
+                chosen = tuple(dict.fromkeys(beside))
+            entries.append(Entry(case, sampler, contender_of(sampler, sizes, case), chosen))
     return entries
 
 

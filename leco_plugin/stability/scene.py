@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leco_plugin.scenes.city.cameras import QUINCUNX, Lens
+from leco_plugin.scenes.city.render import SUN
 
 Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
 _TINY = 1e-9
-_SUN = np.array([0.48, -0.36, 0.8])
 _SHADE = 0.45
 """Light where the sun does not reach."""
 _FOG_STEPS = 32
@@ -174,20 +174,18 @@ class Seen(NamedTuple):
 
 def photograph(stage: Stage, camera_to_world: Array, lens: Lens) -> Seen:
     """Takes one antialiased picture from a pose [3, 4], metres, OpenGL axes."""
-    size = lens.height, lens.width
-    total, detail, depth = np.zeros((*size, 4)), np.zeros(size, bool), np.zeros(size)
-    for number, place in enumerate(QUINCUNX):
+    found = []
+    for place in QUINCUNX:
         directions = (lens.directions(place) @ camera_to_world[:, :3].T).reshape(-1, 3)
         origins = np.broadcast_to(camera_to_world[:, 3], directions.shape)
-        colours, depths, is_detail = look(stage, origins, directions)
-        total += colours.reshape(*size, 4) / len(QUINCUNX)
-        detail |= is_detail.reshape(size)
-        if number == 0:
-            depth = depths.reshape(size)
-    alpha = total[..., 3:]
-    straight = np.concatenate([total[..., :3] / np.maximum(alpha, 1e-9), alpha], axis=-1)
-    image = np.rint(255 * straight.clip(0, 1)).astype(np.uint8)
-    return Seen(image, depth.astype(np.float32), detail)
+        found.append(look(stage, origins, directions))
+    colours, depths, are_details = map(np.stack, zip(*found))
+    total, size = (colours / len(QUINCUNX)).sum(axis=0), (lens.height, lens.width)
+    alpha = total[:, 3:]
+    straight = np.concatenate([total[:, :3] / np.maximum(alpha, 1e-9), alpha], axis=-1)
+    image = np.rint(255 * straight.clip(0, 1)).astype(np.uint8).reshape(*size, 4)
+    depth = depths[0].astype(np.float32).reshape(size)
+    return Seen(image, depth, are_details.any(axis=0).reshape(size))
 
 
 def look(stage: Stage, origins: Array, directions: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -213,7 +211,7 @@ def look(stage: Stage, origins: Array, directions: Array) -> tuple[Array, Array,
 
 
 def _light(paint: Paint, positions: Array, normals: Array) -> Array:
-    light = _SHADE + (1.0 - _SHADE) * np.maximum(normals @ _SUN, 0.0)
+    light = _SHADE + (1.0 - _SHADE) * np.maximum(normals @ SUN, 0.0)
     return np.clip(paint.at(positions) * light[:, None], 0.0, 1.0)
 
 

@@ -54,24 +54,16 @@ Say = Callable[[str], None]
 
 def make_table(
     out: Path,
-    cases: Sequence[str] = (),
-    samplers: Sequence[str] = (),
-    seeds: Sequence[int] = (0,),
-    seeds_beside: Sequence[int] = (),
-    quick: bool = False,
-    minutes: float | None = None,
+    cases: Sequence[str],
+    samplers: Sequence[str],
+    seeds: Sequence[int],
+    seeds_beside: Sequence[int],
+    quick: bool,
+    minutes: float | None,
 ) -> dict[str, Any]:
-    """Makes what is missing of a table and draws it.
-
-    Args:
-        cases, samplers: their names; none is all.
-        seeds, seeds_beside: of each cell, and of some samplers; see `entries_of`.
-        minutes: that this may take, about; None is as many as it takes.
-    Returns:
-        The results, as in `stability.json`.
-    Raises:
-        ValueError, OSError: a name or the folder is wrong; nothing was started.
-    """
+    """Makes what is missing of a table and draws it, by the options of `leco stability`; returns
+    the results, as in `stability.json`. For a wrong name or folder ValueError or OSError, before
+    anything is started."""
     if minutes is not None and not 0.0 < minutes < math.inf:
         raise InputError(f"a table is made in a positive number of minutes, not {minutes}")
     chosen, compared = cases_named(tuple(cases)), plan.samplers_named(tuple(samplers))
@@ -94,12 +86,9 @@ def make_table(
 class Suite:
     """One table: its scenes, its runs, and its results so far.
 
-    Args:
-        out: its folder; `scenes` holds what is photographed, `runs` what was run, by scene.
-        cases, samplers, seeds, sizes, beside: as of `entries_of`.
-    Raises:
-        ValueError, OSError: there is nothing to run or no seed, or the folder is of something else,
-            of other sizes or versions.
+    In its folder `scenes` holds what is photographed, `runs` what was run, by scene. ValueError or
+    OSError where there is nothing to run or no seed, or the folder is of something else, of other
+    sizes or versions. Arguments are as of `entries_of`.
     """
 
     def __init__(

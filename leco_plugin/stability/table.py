@@ -11,7 +11,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from PIL import Image
 
 from leco_plugin.chart.summary import sentence
@@ -100,21 +99,22 @@ def titles(results: Results) -> tuple[str, str]:
 def _count_passes(results: Results) -> str:
     cells = [cell for row in results["cases"] for cell in row["cells"].values()]
     compared = [one for one in results["samplers"] if one["reference"] is not None]
-    parts: list[str] = []
+    passed: list[tuple[str, int, int]] = []
     for one in sorted(compared, key=lambda one: one["name"] != LEARNED):
         held = [word for word in verdicts_of(results, one["name"]) if word != "no reference"]
         if held:
-            word = "" if parts else " passes"
-            parts.append(f"{one['title']}{word} {held.count('pass')} of {len(held)}")
-    if not parts:
+            passed.append((one["title"], held.count("pass"), len(held)))
+    if not passed:
         return NO_VERDICT if any(cell["seeds"] for cell in cells) else NOTHING
-    parts[0] += " cases" if not parts[0].endswith(" of 1") else " case"
+    (first, count, of), *others = passed
+    parts = [f"{first} passes {count} of {counted(of, 'case')}"]
     ours = [row["cells"].get(LEARNED, {}) for row in results["cases"] if not row["must_fail"]]
     apart = sum(cell.get("verdict") == "no reference" and cell["seeds"] > 0 for cell in ours)
     if apart:
         title = next(one["title"] for one in compared if one["name"] == LEARNED)
-        who = "it" if parts[0].startswith(title) else title
-        parts.insert(1, f"for {apart} more {who} has no dense run that trains")
+        who = "it" if first == title else title
+        parts.append(f"for {apart} more {who} has no dense run that trains")
+    parts += [f"{title} {count} of {of}" for title, count, of in others]
     if missing := sum(cell["missing"] for cell in cells):
         parts.append(counted(missing, "seed of a cell is missing", "seeds of cells are missing"))
     if is_unproven(results):
@@ -248,9 +248,9 @@ def draw_side_by_side(pictures: Mapping[str, Path], title: str, path: Path) -> N
         left = number / len(pictures)
         axes = figure.add_axes((left + 0.008, 0.02, 1 / len(pictures) - 0.016, 0.78))
         with Image.open(picture) as image:
-            pixels = np.asarray(image.convert("RGBA"), dtype=float) / 255.0
-        alpha = pixels[..., 3:]
-        axes.imshow(pixels[..., :3] * alpha + 1.0 - alpha, interpolation="nearest")
+            shown = image.convert("RGBA")
+        white = Image.new("RGBA", shown.size, "white")
+        axes.imshow(Image.alpha_composite(white, shown), interpolation="nearest")
         axes.set_title(name, fontsize=10, loc="left", pad=4)
         axes.axis("off")
     save_whole(figure, path, dpi=110)

@@ -114,7 +114,7 @@ def measure(
     model, dataset = pipeline.model, manager.eval_dataset
     pipeline.eval()
     scale = float(manager.train_dataparser_outputs.dataparser_scale)
-    lost = met = samples = candidates = 0
+    counts: list[tuple[int, ...]] = []
     errors, detail_errors, colours = [], [], []
     shown = None
     for number, file in enumerate(dataset.image_filenames):
@@ -126,9 +126,7 @@ def measure(
         depth = truth["depth"][looked_at] * scale
         seen = flat[looked_at.to(pipeline.device)]
         nearest, kept, most = find_samples(model, seen, depth, dense_samples)
-        lost_here, met_here = count_lost(nearest, depth, truth["shown_by"][looked_at])
-        lost, met = lost + lost_here, met + met_here
-        samples, candidates = samples + kept, candidates + most
+        counts.append((*count_lost(nearest, depth, truth["shown_by"][looked_at]), kept, most))
         detail = truth["detail"]
         asked = torch.ones_like(detail) if shown is None else detail | looked_at
         rgb = render_rays(model, flat[asked.to(pipeline.device)], RAYS_AT_ONCE).cpu()
@@ -141,6 +139,7 @@ def measure(
         if shown is None:
             shown = (255 * rgb.view(height, width, 3)).round().byte().numpy()
     pipeline.train()
+    lost, met, samples, candidates = map(sum, zip(*counts))
     detail_error, colour = torch.cat(detail_errors), torch.cat(colours)
     assert shown is not None
     found = Measured(

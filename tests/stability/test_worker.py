@@ -26,6 +26,7 @@ from leco_plugin.samplers.base import DenseEstimator, Estimator
 from leco_plugin.samplers.boxes import nested_boxes
 from leco_plugin.samplers.registry import SamplerSpec
 from leco_plugin.scenes.whole_files import write_json
+from leco_plugin.stability.cases import CASES
 from leco_plugin.stability.photographs import TRUTH, YARD, Capture, write_scene
 from leco_plugin.stability.plan import DENSE_LEVELS, SAMPLERS, Sizes, contender_of
 from leco_plugin.stability.verdict import judge
@@ -85,7 +86,7 @@ def run(contender: Contender, scene: Path, folder: Path) -> dict[str, Any]:
 
 
 def on_small_host(sampler: str) -> Contender:
-    base = contender_of(SAMPLERS["dense"], MICRO, {}, {})
+    base = contender_of(SAMPLERS["dense"], MICRO, CASES["yard"])
     return replace(base, sampler=sampler, changes={**base.changes, **SMALL, **sampled_by(sampler)})
 
 
@@ -117,7 +118,7 @@ def test_a_packed_host_that_skips_half_of_the_scene_loses_its_surfaces(
 
 
 def test_a_dense_proposal_host_samples_everywhere(scene: Path, tmp_path: Path) -> None:
-    contender = contender_of(SAMPLERS["dense-proposal"], MICRO, {}, {})
+    contender = contender_of(SAMPLERS["dense-proposal"], MICRO, CASES["yard"])
     record = run(contender, scene, tmp_path / "run")
     assert record["measured"]["kept_fraction"] == 1.0
     assert record["train_queries"]["proposal"] == 0
