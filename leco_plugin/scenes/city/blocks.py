@@ -26,7 +26,7 @@ from leco_plugin.scenes.city.shapes import (
     Rectangle,
     Shapes,
     add_roof,
-    add_turned,
+    rounded,
     square,
 )
 
@@ -92,8 +92,29 @@ class Block:
     def turned(
         self, x: float, y: float, profile: list[tuple[float, float, int]], foot: int, sides: int = 8
     ) -> None:
-        """A turned solid on the lot, in block coordinates."""
-        add_turned(self.shapes, self.canvas, self.x + x, self.y + y, profile, foot, sides)
+        """Stands a turned solid (pole, tree, tank) on a low square foot, which keeps the face under
+        it simple; `x`, `y` in block coordinates. `profile` lists radius and height above the foot
+        in metres, from the foot up, with the paint of the stretch that ends there; `sides` is a
+        multiple of 4."""
+        reach = round(profile[0][0] + 0.12, 2)
+        x, y = round(float(self.x + x), 2), round(float(self.y + y), 2)
+        base = round(self.canvas.height(x, y) + 0.12, 2)
+        x0, x1, y0, y1 = area = rounded(square(reach, x, y))
+        self.canvas.stroke(area, base, foot, covered=True)
+        turn = 2 * np.pi * np.arange(sides) / sides
+        circle = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(sides)])
+        rings = [np.array([x, y, base + z]) + radius * circle for radius, z, _ in profile]
+        corners = np.array([[x1, y1, base], [x0, y1, base], [x0, y0, base], [x1, y0, base]])
+        for corner, following, arc in zip(
+            corners, np.roll(corners, -1, 0), np.arange(sides).reshape(4, -1)
+        ):
+            arc = [*arc, (arc[-1] + 1) % sides]
+            for a, b in pairwise(arc):
+                self.shapes.add_polygon(np.stack([rings[0][b], rings[0][a], corner]), foot)
+            self.shapes.add_polygon(np.stack([rings[0][arc[-1]], corner, following]), foot)
+        for (lower, upper), (_, _, paint) in zip(pairwise(rings), profile[1:]):
+            self.shapes.add_between(upper, lower, paint, shared=1)
+        self.shapes.add_polygon(rings[-1], profile[-1][2])
 
     def tree(self, x: float, y: float, crown: float) -> None:
         """A tree with the given crown radius in metres."""

@@ -179,13 +179,12 @@ def _wires(shapes: Shapes, built: NDArray[np.bool_], middle: Array, lot: float, 
                     add_wire(shapes, np.column_stack([*columns, path[:, 1]]), 0.05, metal)
 
 
-def _sagging(poles: Array, height: float, sag: float = 0.5, parts: int = 3) -> Array:
-    """Points [V, 2] (along, z) of a wire that hangs from `poles` [P] at `height`, by parabolas."""
-    t = np.linspace(0, 1, parts + 1)[:-1]
-    spans = [
-        np.column_stack([a + t * (b - a), height - sag * 4 * t * (1 - t)])
-        for a, b in pairwise(poles)
-    ]
+def _sagging(poles: Array, height: float) -> Array:
+    """Points [V, 2] (along, z) of a wire that hangs from `poles` [P] at `height`, by parabolas half
+    a metre deep."""
+    t = np.linspace(0, 1, 4)[:-1]
+    low = height - 0.5 * 4 * t * (1 - t)
+    spans = [np.column_stack([a + t * (b - a), low]) for a, b in pairwise(poles)]
     return np.concatenate([*spans, [[poles[-1], height]]])
 
 

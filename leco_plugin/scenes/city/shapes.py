@@ -109,45 +109,12 @@ def add_roof(
     shapes.add_hull(corners, [*slopes, *ends, [0, 1, 2, 3]])
 
 
-def add_turned(
-    shapes: Shapes,
-    canvas: Canvas,
-    x: float,
-    y: float,
-    profile: list[tuple[float, float, int]],
-    foot: int,
-    sides: int = 8,
-) -> None:
-    """Stands a turned solid (pole, tree, tank) on a low square foot, which keeps the face under it
-    simple. `profile` lists radius and height above the foot in metres, from the foot up, with the
-    paint of the stretch that ends there; `sides` is a multiple of 4."""
-    reach = round(profile[0][0] + 0.12, 2)
-    x, y = round(float(x), 2), round(float(y), 2)
-    base = round(canvas.height(x, y) + 0.12, 2)
-    x0, x1, y0, y1 = area = rounded(square(reach, x, y))
-    canvas.stroke(area, base, foot, covered=True)
-    turn = 2 * np.pi * np.arange(sides) / sides
-    circle = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(sides)])
-    rings = [np.array([x, y, base + z]) + radius * circle for radius, z, _ in profile]
-    corners = np.array([[x1, y1, base], [x0, y1, base], [x0, y0, base], [x1, y0, base]])
-    for corner, following, arc in zip(
-        corners, np.roll(corners, -1, 0), np.arange(sides).reshape(4, -1)
-    ):
-        arc = [*arc, (arc[-1] + 1) % sides]
-        for a, b in pairwise(arc):
-            shapes.add_polygon(np.stack([rings[0][b], rings[0][a], corner]), foot)
-        shapes.add_polygon(np.stack([rings[0][arc[-1]], corner, following]), foot)
-    for (lower, upper), (_, _, paint) in zip(pairwise(rings), profile[1:]):
-        shapes.add_between(upper, lower, paint, shared=1)
-    shapes.add_polygon(rings[-1], profile[-1][2])
-
-
-def add_wire(shapes: Shapes, path: Array, radius: float, paint: int, sides: int = 4) -> None:
-    """Hangs a wire along `path` [V, 3], straight in plan; `radius` in metres. The rings stand
-    upright across the path, so that neighbouring pieces share a whole face."""
+def add_wire(shapes: Shapes, path: Array, radius: float, paint: int) -> None:
+    """Hangs a wire of four sides along `path` [V, 3], straight in plan; `radius` in metres. Its
+    rings stand upright across the path, so that neighbouring pieces share a whole face."""
     along = (path[-1] - path[0]) * [1, 1, 0]
     across = np.cross(along / np.linalg.norm(along), [0.0, 0.0, 1.0])
-    turn = 2 * np.pi * np.arange(sides) / sides
+    turn = 2 * np.pi * np.arange(4) / 4
     ring = radius * (np.cos(turn)[:, None] * across + np.sin(turn)[:, None] * [0.0, 0.0, 1.0])
     for a, b in pairwise(path):
         shapes.add_between(a + ring, b + ring, paint)
