@@ -100,10 +100,10 @@ class Faces:
         middle, radius = (low + high) / 2, np.linalg.norm(high - low) / 2
         bounds = self.bounds[candidates]
         least = np.maximum(np.maximum(bounds[:, 0] - middle, middle - bounds[:, 1]), 0)
-        least = np.sqrt(np.einsum("fk,fk->f", least, least))
+        least = np.sqrt(_dot(least, least))
         first = np.searchsorted(candidates, self.first)
         most = np.maximum(bounds[first:, 1] - middle, middle - bounds[first:, 0])
-        reach = np.sqrt(np.einsum("fk,fk->f", most, most).min(initial=np.inf))
+        reach = np.sqrt(_dot(most, most).min(initial=np.inf))
         reach = min(reach, least[:first].min(initial=np.inf)) + 2 * radius
         return candidates[least <= reach * (1 + 1e-9)]
 
@@ -122,11 +122,7 @@ class Faces:
         limits, others = limits[:, first:], self.triangles[candidates[first:] - self.first]
         nearest = np.minimum(nearest, squared_to_triangles(points, others[limits.argmin(1)]))
         rows, columns = np.nonzero(limits < nearest[:, None])
-        if len(rows):
-            starts = np.flatnonzero(np.diff(rows, prepend=-1))
-            found = squared_to_triangles(points[rows], others[columns])
-            touched = rows[starts]
-            nearest[touched] = np.minimum(nearest[touched], np.minimum.reduceat(found, starts))
+        np.minimum.at(nearest, rows, squared_to_triangles(points[rows], others[columns]))
         return nearest
 
 
