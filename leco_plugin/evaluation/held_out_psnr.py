@@ -11,7 +11,7 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-from leco_plugin.evaluation.metrics import psnr
+from leco_plugin.evaluation.metrics import psnr, spread_evenly
 from leco_plugin.learning.dense import evaluating
 from leco_plugin.learning.quality import doubts_of_field, psnr_of_one_colour
 from leco_plugin.log import note
@@ -62,6 +62,7 @@ class HeldOutPsnr:
         return held_out_sampler(self.manager) is not None
 
     def look(self) -> None:
+        """Measures, if it is time and there is time to."""
         now = time.monotonic()
         old = now >= self.due - BETWEEN + OLD and self.cost <= SHARE_WHEN_OLD * OLD
         affordable = old or self.spent + self.cost <= SHARE_OF_TIME * (now - self.began)
@@ -126,16 +127,15 @@ class HeldOutPsnr:
         dataset: Any = getattr(self.manager, "eval_dataset", None)
         if dataset is None or len(dataset) == 0:
             return None
-        count = min(TEST_PHOTOGRAPHS, len(dataset))
+        chosen = spread_evenly(len(dataset), TEST_PHOTOGRAPHS)
         generator, cameras = torch.Generator().manual_seed(0), dataset.cameras.to("cpu")
         found: list[tuple[RayBundle, Tensor]] = []
-        for number in torch.linspace(0, len(dataset) - 1, count).round().long().tolist():
+        for number in chosen:
             image = dataset.get_data(number)["image"]
-            places = torch.rand(FEWEST_LAST // count, 2, generator=generator)
-            rows, columns = (places * torch.tensor(image.shape[:2])).long().unbind(-1)
-            coords = torch.stack([rows, columns], dim=-1) + 0.5
-            rays = cameras.generate_rays(camera_indices=number, coords=coords)
-            found.append((rays, image[rows, columns]))
+            places = torch.rand(FEWEST_LAST // len(chosen), 2, generator=generator)
+            pixels = (places * torch.tensor(image.shape[:2])).long()
+            rays = cameras.generate_rays(camera_indices=number, coords=pixels + 0.5)
+            found.append((rays, image[tuple(pixels.T)]))
         return self._psnr_of(found)
 
     def doubts(self, reached: float | None) -> list[str]:

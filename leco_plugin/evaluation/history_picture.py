@@ -13,11 +13,13 @@ from PIL import Image
 
 from leco_plugin.chart.theme import LIGHT, new_figure, plain, save_whole
 from leco_plugin.evaluation.inspection import cameras_of
+from leco_plugin.evaluation.metrics import spread_evenly
 from leco_plugin.evaluation.occupancy_picture import (
     HORIZONTAL,
     draw_slice,
     heights_seen_from_above,
     interesting_box,
+    kept_cells,
     middle_of,
     surface_points,
 )
@@ -41,26 +43,23 @@ OPAQUE = 1e4
 
 
 def draw_history(occupancy: Occupancy, folder: Path, path: Path) -> Path:
-    """Draws how an occupancy was learned, from the history in the folder of its run.
+    """Draws how an occupancy was learned, from the history in the folder of its run. A .gif moves;
+    other pictures show the first look, two between, and the last.
 
-    Args:
-        path: of the picture. A .gif moves; others show the first look, two between, and the last.
     Raises:
         InputError: the run has no history, or one of another gate.
         OSError, ValueError: the picture cannot be written there, or is of no known kind.
     """
     film = _Film(occupancy, _read(occupancy, folder))
-    count = len(film.history)
+    count, frames = len(film.history), []
     if path.suffix.lower() != ".gif":
         return save_whole(film.still(spread_evenly(count, STILL)), path, dpi=DPI)
-    frames = []
     shown = spread_evenly(count, MOST_FRAMES)
     with bar("Drawing how it was learned") as progress:
-        for number, figure in enumerate(film.moving(shown)):
+        for figure in film.moving(shown):
             figure.canvas.draw()
-            pixels = np.asarray(figure.canvas.buffer_rgba())[..., :3]
-            frames.append(Image.fromarray(pixels))
-            progress((number + 1) / len(shown))
+            frames.append(Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3]))
+            progress(len(frames) / len(shown))
     write_film(frames, path, [FRAME] * (len(frames) - 1) + [LAST_FRAME], FRAME_COLOURS)
     return path
 
@@ -86,13 +85,6 @@ def write_film(
     write_whole(path, lambda file: few[0].save(file, "GIF", duration=durations, **options))
 
 
-def spread_evenly(count: int, most: int) -> list[int]:
-    """Up to `most` of the numbers below `count`, the first and the last among them."""
-    places = torch.linspace(0, count - 1, min(count, most))
-    numbers: list[int] = places.round().int().unique().tolist()
-    return numbers
-
-
 def _read(occupancy: Occupancy, folder: Path) -> GateHistory:
     file = folder / FILE_NAME
     try:
@@ -113,8 +105,9 @@ class _Film:
         self.history = history
         self.occupancy = copy.deepcopy(as_learned(occupancy))
         self.box = interesting_box(occupancy, cameras_of(occupancy))
-        low, high = heights_seen_from_above(occupancy, self.box)
-        middle = middle_of(surface_points(occupancy, self.box, low)[0], self.box)
+        cells = kept_cells(occupancy, self.box)
+        low, high = heights_seen_from_above(cells)
+        middle = middle_of(surface_points(cells, low)[0], self.box)
         self.places = ((2, low + HORIZONTAL[0] * (high - low)), (1, float(middle[1])))
         """The axis that each slice is normal to, and its position along that, scene units."""
         self.shares = torch.stack(history.shares).numpy()
@@ -122,15 +115,14 @@ class _Film:
 
     def still(self, looks: list[int]) -> Any:
         """A figure with a column for each of some looks, over the lines of all."""
-        figure = new_figure((4 * len(looks), 10), dpi=DPI, layout="constrained")
-        grid = figure.add_gridspec(3, 2 * len(looks), height_ratios=(1.0, 0.5, 0.8))
-        for column, look in enumerate(looks):
-            for row in range(2):
-                axes = figure.add_subplot(grid[row, 2 * column : 2 * column + 2])
-                self._draw_slice(axes, row, look)
-                if row == 0:
-                    axes.set_title(f"step {self.history.steps[look]}: " + axes.get_title())
         half = len(looks)
+        figure = new_figure((4 * half, 10), dpi=DPI, layout="constrained")
+        grid = figure.add_gridspec(3, 2 * half, height_ratios=(1.0, 0.5, 0.8))
+        for column, look in enumerate(looks):
+            place = slice(2 * column, 2 * column + 2)
+            above, below = (figure.add_subplot(grid[row, place]) for row in range(2))
+            self._draw_slices(above, below, look)
+            above.set_title(f"step {self.history.steps[look]}: " + above.get_title())
         self._draw_lines(figure.add_subplot(grid[2, :half]), figure.add_subplot(grid[2, half:]))
         return figure
 
@@ -144,16 +136,15 @@ class _Film:
         for look in looks:
             for axes in (*left, *right):
                 axes.clear()
-            for row, axes in enumerate(left):
-                self._draw_slice(axes, row, look)
-            self._draw_lines(right[0], right[1], look)
+            self._draw_slices(*left, look)
+            self._draw_lines(*right, look)
             figure.suptitle(f"Learning what is empty: step {self.history.steps[look]}")
             yield figure
 
-    def _draw_slice(self, axes: Any, row: int, look: int) -> None:
+    def _draw_slices(self, above: Any, below: Any, look: int) -> None:
         self.occupancy.gate.load_state_dict(self.history.weights[look])
-        normal, at = self.places[row]
-        draw_slice(axes, self.occupancy, self.box, normal, at, pixels=FRAME_PIXELS)
+        for axes, (normal, at) in zip((above, below), self.places):
+            draw_slice(axes, self.occupancy, self.box, normal, at, pixels=FRAME_PIXELS)
 
     def _draw_lines(self, above: Any, below: Any, look: int | None = None) -> None:
         """Shares of points and mean densities against steps, as far as one look, or all."""

@@ -39,6 +39,12 @@ def image_metrics(predicted: Tensor, truth: Tensor) -> dict[str, float]:
     return metrics | {name: value for name, value in distances.items() if value is not None}
 
 
+def spread_evenly(count: int, most: int) -> list[int]:
+    """Up to `most` of the numbers below `count`, the first and the last among them."""
+    numbers: list[int] = torch.linspace(0, count - 1, min(count, most)).round().int().tolist()
+    return numbers
+
+
 def decibels(squared_error: float) -> float:
     """The PSNR of a mean squared error of colours in 0..1, at most 120 dB."""
     return -10.0 * math.log10(max(squared_error, 1e-12))

@@ -17,6 +17,7 @@ from leco_plugin.evaluation.inspection import SceneColours, ViewBox
 from leco_plugin.evaluation.occupancy_picture import (
     heights_seen_from_above,
     interesting_box,
+    kept_cells,
     title_of,
 )
 from leco_plugin.occupancy import Occupancy
@@ -47,7 +48,7 @@ def write_page(occupancy: Occupancy, path: Path, colours: SceneColours | None = 
 
     cameras = inspection.cameras_of(occupancy)
     box = interesting_box(occupancy, cameras)
-    lowest, highest = heights_seen_from_above(occupancy, box)
+    lowest, highest = heights_seen_from_above(kept_cells(occupancy, box))
     faces = _kept_faces(occupancy, box, lowest)
     figure = plotly.Figure()
     if len(faces):
@@ -101,12 +102,10 @@ def faces_of(inside: Tensor, box: ViewBox, beyond: bool) -> Tensor:
 def _kept_faces(occupancy: Occupancy, box: ViewBox, lowest: float) -> Tensor:
     """Faces [F, 4, 3] of kept cells, without what is below the ground at `lowest`, scene units; in
     cells as small as `MOST_FACES` allows."""
-    for cells in CELLS:
-        positions = box.middles(cells)
-        kept = inspection.query(occupancy, positions) >= occupancy.threshold
-        faces = faces_of(kept, box, beyond=True)
-        margin = 2.0 * float((box.high - box.low).max()) / cells
-        faces = faces[faces[..., 2].amax(dim=1) > lowest - margin]
+    for longest in CELLS:
+        cells = kept_cells(occupancy, box, longest)
+        faces = faces_of(cells.kept, box, beyond=True)
+        faces = faces[faces[..., 2].amax(dim=1) > lowest - 2.0 * cells.size]
         if len(faces) <= MOST_FACES:
             break
     return faces

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -50,12 +50,9 @@ def draw(
     colours: SceneColours | None = None,
     theme: Theme = LIGHT,
 ) -> Path:
-    """Draws two horizontal and two vertical slices of o(x), and the kept points.
+    """Draws two horizontal and two vertical slices of o(x), the horizontal ones over the scene's
+    colours if they are known, and the kept points.
 
-    Args:
-        path: its ending chooses the kind of the picture.
-        colours: of the scene, drawn under the horizontal slices; None leaves them out.
-        theme: of the page that shows it.
     Raises:
         OSError, ValueError: the picture cannot be written there, or is of no known kind.
     """
@@ -66,22 +63,23 @@ def draw(
 def _figure(occupancy: Occupancy, colours: SceneColours | None, theme: Theme) -> Any:
     cameras = inspection.cameras_of(occupancy)
     box = interesting_box(occupancy, cameras)
-    low, high = heights_seen_from_above(occupancy, box)
-    points, normals = surface_points(occupancy, box, low)
-    ground = None if colours is None else seen_from_above(occupancy, box, colours)
+    cells = kept_cells(occupancy, box)
+    low, high = heights_seen_from_above(cells)
+    points, normals = surface_points(cells, low)
+    ground = None if colours is None else seen_from_above(cells, colours)
     figure = new_figure((10.5, 6.4), theme.page, layout="constrained")
     wide, tall = (box.high - box.low)[[0, 2]].tolist()
     ratios = (1.0, min(1.0, max(0.5, 1.6 * tall / wide)))
     grid = figure.add_gridspec(2, 6, height_ratios=ratios, hspace=0.04)
     middle = middle_of(points, box)
-    slices = [
-        (grid[0, 2 * i : 2 * i + 2], 2, height)
-        for i, height in enumerate(differing_heights(occupancy, box, low, high))
-    ]
-    slices += [(grid[1, 3 * i : 3 * i + 3], a, float(middle[a])) for i, a in enumerate((1, 0))]
-    for place, normal, at in slices:
+    lower, upper = differing_heights(occupancy, box, low, high)
+    for place, normal, at, under in (
+        (grid[0, :2], 2, lower, ground),
+        (grid[0, 2:4], 2, upper, ground),
+        (grid[1, :3], 1, float(middle[1]), None),
+        (grid[1, 3:], 0, float(middle[0]), None),
+    ):
         axes = figure.add_subplot(place)
-        under = ground if normal == 2 else None
         shown = draw_slice(axes, occupancy, box, normal, at, cameras=cameras, under=under)
     _draw_points(figure.add_subplot(grid[0, 4:6], projection="3d"), points, normals, (low, high))
     colour_bar = figure.colorbar(shown, ax=figure.axes[2:4], shrink=0.9, pad=0.01, fraction=0.03)
@@ -157,7 +155,7 @@ def draw_slice(
 
 
 def middle_of(points: Tensor, box: ViewBox) -> Tensor:
-    """[3] the median of points [P, 3]; the middle of the box where there are none."""
+    """The median [3] of points [P, 3]; the middle of the box where there are none."""
     return points.median(dim=0).values if len(points) else (box.low + box.high) / 2
 
 
@@ -165,11 +163,11 @@ def interesting_box(occupancy: Occupancy, cameras: Tensor) -> ViewBox:
     """The box around what is kept and the cameras, but for those far from all others, inside the
     occupancy's whole box."""
     whole = inspection.whole_box(occupancy)
-    _, positions, kept = _kept_cells(occupancy, whole, SEARCH_CELLS)
+    cells = kept_cells(occupancy, whole, SEARCH_CELLS)
     inside = ((cameras >= whole.low) & (cameras <= whole.high)).all(dim=-1)
     if len(cameras):
         inside &= distances_from_middle(cameras) <= FAR_CAMERA
-    found = torch.cat([positions[kept], cameras[inside]])
+    found = torch.cat([cells.positions[cells.kept], cameras[inside]])
     if len(found) == 0:
         return whole
     low, high = found.amin(dim=0), found.amax(dim=0)
@@ -177,16 +175,36 @@ def interesting_box(occupancy: Occupancy, cameras: Tensor) -> ViewBox:
     return ViewBox(torch.maximum(low - margin, whole.low), torch.minimum(high + margin, whole.high))
 
 
-def heights_seen_from_above(occupancy: Occupancy, box: ViewBox) -> tuple[float, float]:
+class KeptCells(NamedTuple):
+    """Nearly cubic cells of a box, of one `size`, in scene units: their middles [X, Y, Z, 3], o(x)
+    there [X, Y, Z], and whether they are kept, bool [X, Y, Z]."""
+
+    box: ViewBox
+    size: float
+    positions: Tensor
+    values: Tensor
+    kept: Tensor
+
+
+def kept_cells(occupancy: Occupancy, box: ViewBox, longest: int = CELLS) -> KeptCells:
+    """The cells of a box, `longest` along its longest side."""
+    positions = box.middles(longest)
+    values = inspection.query(occupancy, positions)
+    size = float((box.high - box.low).max()) / longest
+    return KeptCells(box, size, positions, values, values >= occupancy.threshold)
+
+
+def heights_seen_from_above(cells: KeptCells) -> tuple[float, float]:
     """Heights, scene units, between which lies nearly all that a view straight down shows, without
     what is kept below the ground."""
-    _, positions, kept = _kept_cells(occupancy, box, CELLS)
-    heights = torch.where(kept, positions[..., 2], -torch.inf).amax(dim=-1)
+    bottom, top = float(cells.box.low[2]), float(cells.box.high[2])
+    levels = cells.positions[..., 2]
+    heights = torch.where(cells.kept, levels, -torch.inf).amax(dim=-1)
     heights = heights[heights.isfinite()].sort().values
-    if len(heights) == 0 or heights[len(heights) // 20] == positions[..., 2].max():
-        return float(box.low[2]), float(box.high[2])  # nothing, or the lid of what is all kept
+    if len(heights) == 0 or heights[len(heights) // 20] == levels.max():
+        return bottom, top  # nothing, or the lid of what is all kept
     low, high = float(heights[len(heights) // 20]), float(heights[-1 - len(heights) // 200])
-    around = 2.0 * float(box.high[2] - box.low[2]) / kept.shape[2] if low == high else 0.0
+    around = 2.0 * (top - bottom) / levels.shape[2] if low == high else 0.0
     return low - around, high + around
 
 
@@ -212,37 +230,26 @@ def differing_heights(
     return lower, upper
 
 
-def seen_from_above(occupancy: Occupancy, box: ViewBox, colours: SceneColours) -> Array:
+def seen_from_above(cells: KeptCells, colours: SceneColours) -> Array:
     """Colours of the highest kept place above each place: [Y, X, 4] uint8, clear where none is."""
-    _, positions, kept = _kept_cells(occupancy, box, CELLS)
+    kept = cells.kept
     layers = torch.arange(kept.shape[2]).expand_as(kept).where(kept, -1).amax(dim=2)
-    columns = (layers >= 0).nonzero(as_tuple=True)
+    x, y = (layers >= 0).nonzero(as_tuple=True)
     seen = np.zeros((*kept.shape[:2], 4), np.uint8)
-    if len(columns[0]):
-        x, y = columns
-        found = colours.at(positions[x, y, layers[x, y]])
+    if len(x):
+        found = colours.at(cells.positions[x, y, layers[x, y]])
         seen[x.numpy(), y.numpy()] = np.pad(found, ((0, 0), (0, 1)), constant_values=255)
     return seen.transpose(1, 0, 2)
 
 
-def surface_points(occupancy: Occupancy, box: ViewBox, lowest: float) -> tuple[Tensor, Tensor]:
+def surface_points(cells: KeptCells, lowest: float) -> tuple[Tensor, Tensor]:
     """Kept positions next to skipped ones, and the directions [P, 3] in which o(x) falls there."""
-    values, positions, kept = _kept_cells(occupancy, box, CELLS)
-    margin = 2.0 * float((box.high - box.low).max()) / CELLS
-    at_surface = inspection.exposed(kept, beyond=True)
-    chosen = (at_surface & (positions[..., 2] > lowest - margin)).nonzero()
+    is_above = cells.positions[..., 2] > lowest - 2.0 * cells.size
+    chosen = (inspection.exposed(cells.kept, beyond=True) & is_above).nonzero()
     order = torch.randperm(len(chosen), generator=torch.Generator().manual_seed(0))
-    chosen = chosen[order[:MOST_POINTS]]
-    falls = -torch.stack(torch.gradient(values), dim=-1)
-    at = tuple(chosen.T)
-    return positions[at], torch.nn.functional.normalize(falls[at], dim=-1)
-
-
-def _kept_cells(occupancy: Occupancy, box: ViewBox, longest: int) -> tuple[Tensor, Tensor, Tensor]:
-    """o(x) at the middles of cells [X, Y, Z], those positions [X, Y, Z, 3], and which are kept."""
-    positions = box.middles(longest)
-    values = inspection.query(occupancy, positions)
-    return values, positions, values >= occupancy.threshold
+    at = tuple(chosen[order[:MOST_POINTS]].T)
+    falls = -torch.stack(torch.gradient(cells.values), dim=-1)
+    return cells.positions[at], torch.nn.functional.normalize(falls[at], dim=-1)
 
 
 def _draw_points(axes: Any, points: Tensor, normals: Tensor, heights: tuple[float, float]) -> None:
@@ -259,11 +266,9 @@ def _draw_points(axes: Any, points: Tensor, normals: Tensor, heights: tuple[floa
     light = torch.nn.functional.normalize(torch.tensor([0.35, -0.55, 0.75]), dim=0)
     shade = 0.55 + 0.45 * (normals @ light).clamp(min=0)
     colours = torch.from_numpy(colormaps["viridis"](shares.numpy())[:, :3]) * shade[:, None]
-    x, y, z = points.T.numpy()
-    axes.scatter(x, y, z, c=colours.numpy(), s=3.0, linewidths=0, depthshade=False)
-    axes.set_box_aspect(
-        (points.amax(dim=0) - points.amin(dim=0)).clamp(min=1e-6).tolist(), zoom=1.4
-    )
+    axes.scatter(*points.T.numpy(), c=colours.numpy(), s=3.0, linewidths=0, depthshade=False)
+    sides = points.amax(dim=0) - points.amin(dim=0)
+    axes.set_box_aspect(sides.clamp(min=1e-6).tolist(), zoom=1.4)
     axes.view_init(elev=38, azim=-58)
 
 

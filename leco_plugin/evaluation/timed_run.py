@@ -28,7 +28,7 @@ from leco_plugin.evaluation.clock import (
     peak_process_bytes,
     warm_up,
 )
-from leco_plugin.evaluation.metrics import decibels, image_metrics
+from leco_plugin.evaluation.metrics import decibels, image_metrics, spread_evenly
 from leco_plugin.evaluation.queries import GridUpdates, count_queries
 from leco_plugin.evaluation.report import finite_or_null
 from leco_plugin.hosts.learn_first import FIRST_TIMED, TIMED_STEPS, keep_within
@@ -182,38 +182,38 @@ def set_up(config: TrainerConfig, budget: Budget, seed: int) -> Trainer:
     return trainer
 
 
+@dataclass
 class _Course:
-    """Stands around every step of a run: clock, learning rates, evaluation, the end."""
+    """Stands around every step of a run: clock, learning rates, evaluation, the end. Arguments are
+    those of `timed_run`, with the record to fill and the counts of queries."""
 
-    def __init__(
-        self,
-        trainer: Trainer,
-        budget: Budget,
-        run: TimedRun,
-        queries: Counter[str],
-        curve_points: int,
-        on_progress: Callable[[float], None] | None,
-        on_frozen: Callable[[Trainer], None] | None,
-    ) -> None:
-        self.trainer, self.budget, self.run, self.queries = trainer, budget, run, queries
-        self.on_progress, self.on_frozen = on_progress, on_frozen
+    trainer: Trainer
+    budget: Budget
+    run: TimedRun
+    queries: Counter[str]
+    curve_points: int
+    on_progress: Callable[[float], None] | None
+    on_frozen: Callable[[Trainer], None] | None
+
+    def __post_init__(self) -> None:
         self.clock = Clock()
-        self.marks = [(i + 1) / curve_points for i in range(curve_points - 1)]
+        self.marks = [(i + 1) / self.curve_points for i in range(self.curve_points - 1)]
         self.step_times: list[float] = []
-        self.before_step = queries.copy()
+        self.before_step = self.queries.copy()
         self.share_before = 0.0
+        self.model: Any = self.trainer.pipeline.model
         self.rates = [
             (group, group["lr"])
-            for optimizer in trainer.optimizers.optimizers.values()
+            for optimizer in self.trainer.optimizers.optimizers.values()
             for group in optimizer.param_groups
         ]
         self.updates = GridUpdates(
-            trainer.pipeline.model, lambda step: budget.share(self.clock.now(), step)
+            self.model, lambda step: self.budget.share(self.clock.now(), step)
         )
-        where = TrainingCallbackLocation
-        trainer.callbacks.insert(0, TrainingCallback([where.BEFORE_TRAIN_ITERATION], self.before))
-        trainer.callbacks.append(TrainingCallback([where.BEFORE_TRAIN_ITERATION], self.begun))
-        trainer.callbacks.append(TrainingCallback([where.AFTER_TRAIN_ITERATION], self.after))
+        where, around = TrainingCallbackLocation, self.trainer.callbacks
+        around.insert(0, TrainingCallback([where.BEFORE_TRAIN_ITERATION], self.before))
+        around.append(TrainingCallback([where.BEFORE_TRAIN_ITERATION], self.begun))
+        around.append(TrainingCallback([where.AFTER_TRAIN_ITERATION], self.after))
 
     def before(self, step: int) -> None:
         """Before everything else that happens before a step."""
@@ -226,7 +226,7 @@ class _Course:
 
     def begun(self, step: int) -> None:
         """Before a step, after everything else: a host that learns its occupancy first has it."""
-        if self._look_for_occupancy() and hasattr(self.trainer.pipeline.model, "leco_guide"):
+        if self._look_for_occupancy() and hasattr(self.model, "leco_guide"):
             self.share_before = self.budget.share(self.clock.now(), step)
 
     def after(self, step: int) -> None:
@@ -243,8 +243,7 @@ class _Course:
         else:
             self.step_times.append(seconds)
         run.steps = step + 1
-        if run.steps == TIMED_STEPS or self._learning_time_left() <= 0.0:
-            self._keep_to_learning_time()
+        self._keep_to_learning_time()
         self._foresee_the_end()
         share = self.budget.share(clock.seconds, run.steps)
         if self.on_progress is not None:
@@ -263,18 +262,16 @@ class _Course:
         if self.updates.grids:
             run.learn_seconds = self.updates.clock.seconds
             run.warming_up = self.updates.warming_up
-        progress = getattr(self.trainer.pipeline.model, "progress", None)
-        run.recoveries = getattr(progress, "recoveries", None)
+        run.recoveries = getattr(getattr(self.model, "progress", None), "recoveries", None)
         run.peak_process_bytes = peak_process_bytes()
         run.peak_allocator_bytes = peak_allocator_bytes()
         run.peak_memory_bytes = run.peak_allocator_bytes or run.peak_process_bytes
 
     def _look_for_occupancy(self) -> bool:
         """Notes when there is an occupancy; returns whether there is one since the last look."""
-        model: Any = self.trainer.pipeline.model
-        guide = getattr(model, "leco_guide", None)
-        mixture = getattr(model, "mixture", None)
+        mixture = getattr(self.model, "mixture", None)
         frozen = mixture is not None and bool(mixture.frozen)
+        guide = getattr(self.model, "leco_guide", None)
         learned = mixture if frozen else getattr(guide, "occupancy", None)
         if self.run.freeze_seconds is not None or learned is None:
             return False
@@ -283,14 +280,10 @@ class _Course:
         self.run.at_freezing = {name: report.get(name) for name in PRICES}
         return True
 
-    def _learning_time_left(self) -> float:
-        """Seconds of it; without end where there is no such limit."""
-        return (self.budget.learn_seconds or math.inf) - self.clock.seconds
-
     def _foresee_the_end(self) -> None:
         """For a model that learns itself, which sharpens its gate towards the end."""
         seconds, steps, config = self.budget.seconds, self.run.steps, self.trainer.config
-        mixture = getattr(self.trainer.pipeline.model, "mixture", None)
+        mixture = getattr(self.model, "mixture", None)
         if seconds is None or mixture is None:
             return
         config.max_num_iterations = self.budget.steps or ENDLESS
@@ -300,14 +293,17 @@ class _Course:
             config.max_num_iterations = min(config.max_num_iterations, foreseen)
 
     def _keep_to_learning_time(self) -> None:
-        """As a host that learns first does: a model that learns itself freezes in time."""
-        progress = getattr(self.trainer.pipeline.model, "progress", None)
-        learned = self.run.freeze_seconds is not None
-        if progress is None or learned or self.budget.learn_seconds is None:
+        """As a host that learns first does: a model that learns itself freezes in time. Looked at
+        once, by the first steps, and from when that time is over."""
+        progress, limit = getattr(self.model, "progress", None), self.budget.learn_seconds
+        if progress is None or limit is None or self.run.freeze_seconds is not None:
             return
-        left = self._learning_time_left()
-        more = left / statistics.fmean(self.step_times[FIRST_TIMED:]) if left > 0.0 else 0.0
-        keep_within(progress, more, self.run.steps)
+        left = limit - self.clock.seconds
+        if left <= 0.0:
+            keep_within(progress, 0.0, self.run.steps)
+        elif self.run.steps == TIMED_STEPS:
+            more = left / statistics.fmean(self.step_times[FIRST_TIMED:])
+            keep_within(progress, more, self.run.steps)
 
 
 def run_training(trainer: Trainer) -> None:
@@ -367,20 +363,17 @@ def evaluate_images(trainer: Trainer, most_images: int, queries: Counter[str]) -
     pipeline = trainer.pipeline
     pipeline.eval()
     dataset: Any = pipeline.datamanager.eval_dataset
-    count = min(most_images, len(dataset))
-    chosen = torch.linspace(0, len(dataset) - 1, count).round().long().tolist()
     found: list[dict[str, float]] = []
-    times = []
-    for number in chosen:
+    clock, times = Clock(), []
+    for number in spread_evenly(len(dataset), most_images):
         camera = dataset.cameras[number : number + 1].to(pipeline.device)
-        before, clock = queries.copy(), Clock()
-        with clock.running():
-            outputs = pipeline.model.get_outputs_for_camera(camera)
-        times.append(clock.seconds)
+        before = queries.copy()
+        clock.start()
+        outputs = pipeline.model.get_outputs_for_camera(camera)
+        times.append(clock.stop())
         predicted = outputs["rgb"].clamp(0.0, 1.0)
         image = dataset.get_data(number)["image"].to(predicted.device)
-        truth = true_colours(pipeline.model, image)
-        figures = image_metrics(predicted, truth)
+        figures = image_metrics(predicted, true_colours(pipeline.model, image))
         for kind in ("field", "proposal", "gate"):
             asked = queries[kind] - before[kind]
             figures[f"{kind}_queries_per_ray"] = asked / (predicted.numel() / 3)

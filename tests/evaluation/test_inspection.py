@@ -31,6 +31,7 @@ from leco_plugin.evaluation.occupancy_picture import (
     headline,
     heights_seen_from_above,
     interesting_box,
+    kept_cells,
     surface_points,
 )
 from leco_plugin.occupancy import Occupancy
@@ -87,7 +88,7 @@ def test_a_camera_far_from_all_others_does_not_shrink_what_is_drawn() -> None:
 
 
 def test_points_are_on_the_surface_and_face_outwards() -> None:
-    points, normals = surface_points(ball(), whole_box(ball()), -10.0)
+    points, normals = surface_points(kept_cells(ball(), whole_box(ball())), -10.0)
     offsets = points - torch.tensor(CENTRE)
     assert len(points) > 1000
     assert float((offsets.norm(dim=-1) - RADIUS).abs().mean()) < 0.08
@@ -97,7 +98,7 @@ def test_points_are_on_the_surface_and_face_outwards() -> None:
 
 def test_points_of_a_picture_begin_two_cells_below_the_ground() -> None:
     ground, cell = 0.5, 4.0 / 128
-    points, _ = surface_points(ball(), whole_box(ball()), ground)
+    points, _ = surface_points(kept_cells(ball(), whole_box(ball())), ground)
     assert ground - 2.0 * cell <= float(points[:, 2].min()) < ground - cell
 
 
@@ -118,7 +119,7 @@ def test_heights_are_those_of_what_is_met_from_above(kept: Any, seen: tuple[floa
         threshold=0.5, threshold_value=value, query=lambda at: kept(at).float()
     )
     box = ViewBox(torch.zeros(3), torch.full((3,), 4.0))
-    assert heights_seen_from_above(known, box) == pytest.approx(seen, abs=0.05)
+    assert heights_seen_from_above(kept_cells(known, box)) == pytest.approx(seen, abs=0.05)
 
 
 def test_slices_are_drawn_where_most_decisions_differ() -> None:

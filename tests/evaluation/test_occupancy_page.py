@@ -14,7 +14,7 @@ from page_text import figure_text
 
 from leco_plugin.evaluation.inspection import SceneColours, ViewBox, whole_box
 from leco_plugin.evaluation.occupancy_page import _mesh, faces_of, write_page
-from leco_plugin.evaluation.occupancy_picture import seen_from_above
+from leco_plugin.evaluation.occupancy_picture import kept_cells, seen_from_above
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.coloured_points import PointCloud
 
@@ -78,7 +78,7 @@ def test_a_page_without_a_scene_is_coloured_by_height(tmp_path: Path) -> None:
 
 def test_slices_lie_on_the_colours_seen_from_above(colours: SceneColours) -> None:
     box = whole_box(ball())
-    seen = seen_from_above(ball(), box, colours)
+    seen = seen_from_above(kept_cells(ball(), box), colours)
     y, x = torch.meshgrid(box.axis(1, len(seen)), box.axis(0, seen.shape[1]), indexing="ij")
     offsets = torch.stack([x - CENTRE[0], y - CENTRE[1]], dim=-1)
     inside, far = offsets.norm(dim=-1) < 0.8 * RADIUS, offsets.norm(dim=-1) > 1.3 * RADIUS
