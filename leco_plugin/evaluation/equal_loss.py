@@ -12,7 +12,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from nerfstudio.cameras.rays import RayBundle
@@ -63,7 +63,6 @@ def kept_shares(
     Args:
         weights, scores: [M] of candidates; weights are those near surfaces.
         of_volume: [P] scores of places spread evenly over what rays reach of the scene's box.
-        lost: share of the weight.
     """
     threshold = threshold_losing(weights, scores, lost)
     volume, candidates = ((some >= threshold).double().mean() for some in (of_volume, scores))
@@ -83,8 +82,6 @@ def at_equal_loss(
     are filled with the densities along rays, as a gate is taught them, and at random places.
 
     Args:
-        mixture: whose gate is frozen; it is left as it was.
-        datamanager: with held-out training pixels.
         others: further representations by name, each a score of mapped positions [N, 3]: [N], or
             the scores [n, n, n] of a grid in `mapped_box`.
     Returns:
@@ -104,16 +101,10 @@ def at_equal_loss(
             raise ValueError("no surface is seen by the held-out rays, so that none can be lost")
         taught = candidates_of(mixture, rays_of_photographs(datamanager, TAUGHT_RAYS))
         volume = reached_volume(mixture, taught, VOLUME_POINTS)
-        kept_by = partial(_kept_by, weights)
-        kept = kept_by(occupancies, in_parts(mixture.occupancies, volume))
-        of_grid = partial(_kept_by_grid, weights, mapped_box(mixture), mapped, volume)
-        beside = {
-            name: of_grid(score)
-            if isinstance(score, Tensor)
-            else kept_by(in_parts(score, mapped), in_parts(score, volume))
-            for name, score in (others or {}).items()
-        }
-        rows, left_out = _kept_by_grids(mixture, grids, taught, mapped, weights, of_grid)
+        ground = _Ground(mapped_box(mixture), mapped, weights, volume)
+        kept = ground.kept_by(occupancies, in_parts(mixture.occupancies, volume))
+        beside = {name: ground.kept_by_score(score) for name, score in (others or {}).items()}
+        rows, left_out = _kept_by_grids(mixture, grids, taught, ground) if grids else ([], [])
     return {
         "lost_surface_mass": LOST_SURFACE_MASS,
         "reached_volume": round(len(volume) / VOLUME_POINTS, 5),
@@ -124,9 +115,34 @@ def at_equal_loss(
     }
 
 
-def _kept_by(weights: Tensor, of_rays: Tensor, of_volume: Tensor) -> dict[str, float]:
-    volume, candidates = kept_shares(weights, of_rays, of_volume, LOST_SURFACE_MASS)
-    return {"kept_reached_volume": round(volume, 5), "kept_candidates": round(candidates, 5)}
+class _Ground(NamedTuple):
+    """What representations of one field are compared on."""
+
+    box: ViewBox
+    """Of grids."""
+    mapped: Tensor
+    """[M, 3] candidates of held-out rays."""
+    weights: Tensor
+    """[M] those near surfaces."""
+    volume: Tensor
+    """[P, 3] mapped places that rays reach."""
+
+    def kept_by(self, of_rays: Tensor, of_volume: Tensor) -> dict[str, Any]:
+        """What is kept by a representation with scores [M] of candidates and [P] of places."""
+        volume, candidates = kept_shares(self.weights, of_rays, of_volume, LOST_SURFACE_MASS)
+        return {"kept_reached_volume": round(volume, 5), "kept_candidates": round(candidates, 5)}
+
+    def kept_by_score(self, score: Callable[[Tensor], Tensor] | Tensor) -> dict[str, Any]:
+        """The same of a function of mapped positions, or of a grid [n, n, n], as it is or dilated,
+        whichever keeps less."""
+        if not isinstance(score, Tensor):
+            return self.kept_by(in_parts(score, self.mapped), in_parts(score, self.volume))
+        both = plain_and_dilated(score, *self[:2], self.volume, self.weights, LOST_SURFACE_MASS)
+        rows = [
+            {"dilated": bool(dilated), **self.kept_by(*scores), "octree_bytes": size}
+            for dilated, (*scores, size) in enumerate(both)
+        ]
+        return min(rows, key=lambda one: one["kept_reached_volume"])
 
 
 def near_points(points: Tensor) -> Callable[[Tensor], Tensor]:
@@ -152,47 +168,28 @@ def plain_and_dilated(
         yield of_rays, of_volume, field_grids.octree_bytes(kept)
 
 
-def _kept_by_grid(
-    weights: Tensor, box: ViewBox, mapped: Tensor, volume: Tensor, scores: Tensor
-) -> dict[str, Any]:
-    """What a grid of scores [n, n, n] keeps, as it is or dilated, whichever keeps less."""
-    both = plain_and_dilated(scores, box, mapped, volume, weights, LOST_SURFACE_MASS)
-    rows = [
-        {"dilated": bool(dilated), **_kept_by(weights, of_rays, of_volume), "octree_bytes": size}
-        for dilated, (of_rays, of_volume, size) in enumerate(both)
-    ]
-    return min(rows, key=lambda one: one["kept_reached_volume"])
-
-
 def _kept_by_grids(
-    mixture: Mixture,
-    resolutions: Sequence[int],
-    taught: Tensor,
-    mapped: Tensor,
-    weights: Tensor,
-    of_grid: Callable[[Tensor], dict[str, Any]],
+    mixture: Mixture, resolutions: Sequence[int], taught: Tensor, ground: _Ground
 ) -> tuple[list[dict[str, Any]], list[int]]:
     """Facts of grids of the field, which hold its density at the mapped places `taught` [M, 3] too;
     and the resolutions for which there is no memory or no time."""
-    if not resolutions:
-        return [], []
-    rows, left_out, box = [], [], mapped_box(mixture)
+    rows, left_out = [], []
 
     def floor_of(scores: Tensor) -> float:
-        of_rays = field_grids.look_up_scores(scores, box, mapped)
-        return threshold_losing(weights, of_rays, SPARED * LOST_SURFACE_MASS)
+        of_rays = field_grids.look_up_scores(scores, ground.box, ground.mapped)
+        return threshold_losing(ground.weights, of_rays, SPARED * LOST_SURFACE_MASS)
 
     most = MOST_ON_CPU if mixture.device.type == "cpu" else math.inf
     density = partial(field_grids.density_of, mixture)
-    filling = field_grids.FieldGrids(density, box, (taught, density(taught)), floor_of, most)
+    filling = field_grids.FieldGrids(density, ground.box, (taught, density(taught)), floor_of, most)
     for n in resolutions:
         scores = filling.fill(n) if field_grids.fits_memory(n**3) else None
         if scores is None:
             left_out.append(n)
             continue
-        seconds = round(filling.clock.seconds, 3)
         size = {"resolution": n, "bytes": math.ceil(n**3 / 8)}
-        rows.append({**size, "update_seconds": seconds, **of_grid(scores)})
+        seconds = round(filling.clock.seconds, 3)
+        rows.append({**size, "update_seconds": seconds, **ground.kept_by_score(scores)})
     return rows, left_out
 
 
