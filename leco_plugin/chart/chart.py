@@ -32,7 +32,7 @@ from leco_plugin.evaluation.report import describe_code, describe_machine, read_
 from leco_plugin.log import counted
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import describe_held_out, describe_scene, megapixels_of
-from leco_plugin.scenes.whole_files import write_json
+from leco_plugin.scenes.whole_files import alone_in, write_json
 
 Say = Callable[[str], None]
 NOTHING_SKIPPED = "; no occupancy was learned in this time, so that nothing was skipped"
@@ -106,7 +106,8 @@ class Chart:
             say(line)
             self.write()
 
-        with self.folder.alone():
+        with alone_in(self.folder.path, "chart"):
+            self.folder.clear()
             taken = take_over(self.folder, self.missing(), self.reuse)
             if taken:
                 say(f"{counted(len(taken), 'run')} taken over from other charts")
@@ -153,13 +154,13 @@ class Chart:
 
     def failures(self) -> list[dict[str, Any]]:
         """Runs that ended without a result, by seed, and whether this call asked for them."""
-        asked, found = {(job.contender.key, job.seed) for job in self.jobs}, []
+        asked, found = {job.name for job in self.jobs}, []
         for one in self.folder.failures():
             made = Contender.from_dict(one["contender"])
             if (name := self._name_of(made)) is not None:
                 row = {"name": name, "method": made.method, "sampler": made.sampler}
                 row |= {"seed": one["seed"], "reason": one["reason"]}
-                found.append({**row, "asked": (made.key, one["seed"]) in asked})
+                found.append({**row, "asked": Job(made, one["seed"]).name in asked})
         return sorted(found, key=lambda one: (one["seed"], one["name"]))
 
     def results(self) -> dict[str, Any]:
@@ -217,11 +218,9 @@ class Chart:
         return results
 
     def draw(self) -> dict[str, Any]:
-        """Writes the results, and where a run has succeeded `chart.png`, light and dark, and
-        `chart.html`."""
-        results = self.write()
+        """The same, and where a run has succeeded `chart.png`, light and dark, and `chart.html`."""
+        results, place = self.write(), self.folder.path
         if results["runs"]:
-            place = self.folder.path
             picture.draw(results, place / "chart.png", LIGHT)
             picture.draw(results, place / "chart-dark.png", DARK)
             page.write_page(results, place / "chart.html")

@@ -77,10 +77,6 @@ class Job:
         """Of its files."""
         return f"{self.contender.key}-seed-{self.seed}"
 
-    @property
-    def values(self) -> dict[str, Any]:
-        return {"contender": asdict(self.contender), "seed": self.seed}
-
 
 def changed(config: Any, path: str, value: Any) -> Any:
     """A copy of a config, of dataclasses and dictionaries, with the setting of a dotted path
@@ -167,20 +163,17 @@ def in_this_process(datamanager: Any) -> Any:
 
 def short_names(names: Sequence[str]) -> list[str]:
     """The names without the method where it is the same for all."""
-    method = shared_method(names)
-    return [_split(name)[1] if method else name for name in names]
+    return [METHOD.sub("", name, count=1) for name in names] if shared_method(names) else [*names]
 
 
 def shared_method(names: Sequence[str]) -> str | None:
     """The method with which all of several names begin; None where they differ."""
-    methods = {_split(name)[0] for name in names}
+    methods = {found[1] if (found := METHOD.match(name)) else None for name in names}
     return methods.pop() if len(names) > 1 and len(methods) == 1 else None
 
 
-def _split(name: str) -> tuple[str | None, str]:
-    """Method and the rest of a name, where it has both."""
-    parts = re.fullmatch(r"(.*?)(?: \+ |, )(.*)", name)
-    return (None, name) if parts is None else (parts[1], parts[2])
+METHOD = re.compile(r"(.*?)(?: \+ |, )")
+"""What the name of a contender begins with: its method, and what separates it from the rest."""
 
 
 LEARN_SHARE = 0.4
@@ -215,8 +208,9 @@ class Protocol:
                 f"learning an occupancy may take {self.learn_seconds:g} s of a run of "
                 f"{self.seconds:g} s, which leaves nothing to be guided: give less"
             )
-        counts = self.images, self.curve_points, self.at_once
-        for name, count in zip(("images", "curve points", "runs at once"), counts):
+        counts = {"images": self.images, "curve points": self.curve_points}
+        counts["runs at once"] = self.at_once
+        for name, count in counts.items():
             if count < 1:
                 raise ValueError(f"at least one of the {name} is needed, not {count}")
 
@@ -237,7 +231,6 @@ class Protocol:
 
 
 def require_seeds(seeds: Iterable[int]) -> None:
-    """Raises `InputError` for what numpy does not take as a seed."""
     for seed in seeds:
         if not 0 <= seed < SEEDS:
             raise InputError(f"a seed is a whole number from 0 to {SEEDS - 1}, not {seed}")
@@ -249,14 +242,8 @@ def settings_of(
     """What the runs of one chart share; runs with other settings are not comparable."""
     from leco_plugin import __version__
 
-    return {
-        "format": 1,
-        "scene": scene,
-        "suite": suite,
-        **asdict(protocol),
-        "machine": machine,
-        "version": __version__,
-    }
+    made_on = {"machine": machine, "version": __version__}
+    return {"format": 1, "scene": scene, "suite": suite, **asdict(protocol), **made_on}
 
 
 @dataclass(frozen=True)

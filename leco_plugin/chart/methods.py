@@ -112,7 +112,7 @@ def contenders(methods: Sequence[str], samplers: Sequence[str] = ()) -> list[Con
             except ValueError as error:
                 raise InputError(f"the sampler {sampler!r} has too many cells: {error}") from None
     found: dict[str, Contender] = {}
-    used: set[str] = set()
+    unused = dict.fromkeys(samplers)
     for method in dict.fromkeys(methods):
         usual, allowed = _samplers_of(method)
         fitting = {name: _contender_of(method, name) for name in samplers or usual}
@@ -121,11 +121,11 @@ def contenders(methods: Sequence[str], samplers: Sequence[str] = ()) -> list[Con
             raise InputError(
                 f"{method} has none of the samplers {', '.join(samplers)}; it has {allowed}"
             )
-        used |= set(made)
-        found |= {one.key: one for one in made.values()}
-    unused = [name for name in samplers if name not in used]
+        for name, one in made.items():
+            unused.pop(name, None)
+            found[one.key] = one
     if unused:
-        raise InputError(f"the sampler {unused[0]!r} fits none of {', '.join(methods)}")
+        raise InputError(f"the sampler {next(iter(unused))!r} fits none of {', '.join(methods)}")
     return list(found.values())
 
 
@@ -192,30 +192,32 @@ def _gate_of(sampler: str, spec: SamplerSpec, cells: int | None) -> tuple[str, d
 
 def contender_of_host(method: str, sampler: str, host: Any) -> Contender | None:
     """A host, by its model's config, with a sampler of its kind; None for one of another kind."""
-    proposes = hasattr(host, "num_proposal_samples_per_ray")
     sampler, cells = _name_and_cells(sampler)
     shown = SAMPLER_NAMES.get(sampler, sampler)
-    changes: dict[str, Any] = {"occupancy.sampler": sampler}
+    changes: dict[str, Any] | None = {"occupancy.sampler": sampler}
     if sampler == OWN_SAMPLER:
         shown = _own_sampling_of(host)
+    elif sampler == LONG_STEPS:
+        changes = _long_steps(host)
     else:
-        if sampler == LONG_STEPS:
-            longer = _long_steps(host)
-            name = f"{METHOD_NAMES.get(method, method)} + {shown}"
-            return None if longer is None else Contender(name, method, sampler, longer)
-        if sampler == WITHOUT_GIFTS:
-            changes = {"occupancy.sampler": LEARNED, **NO_GIFTS}
-        spec = registered_samplers()[changes["occupancy.sampler"]]
+        base = LEARNED if sampler == WITHOUT_GIFTS else sampler
+        spec = registered_samplers()[base]
+        proposes = hasattr(host, "num_proposal_samples_per_ray")
         if (spec.proposal if proposes else spec.estimator) is None:
             return None
-        if sampler == DENSE and hasattr(host, "cone_angle"):  # as far as its own grid goes
-            changes["occupancy.options"] = {"levels": getattr(host, "grid_levels", 1)}
         shown, of_gate = _gate_of(sampler, spec, cells)
-        changes |= {f"occupancy.learning.{path}": value for path, value in of_gate.items()}
-        if sampler == GRID:
+        of_gate = {f"occupancy.learning.{path}": value for path, value in of_gate.items()}
+        changes = {"occupancy.sampler": base, **of_gate}
+        if sampler == WITHOUT_GIFTS:
+            changes |= NO_GIFTS
+        elif sampler == DENSE and hasattr(host, "cone_angle"):  # as far as its own grid goes
+            changes["occupancy.options"] = {"levels": getattr(host, "grid_levels", 1)}
+        elif sampler == GRID:
             cells = cells or _own_cells_of(host) or 128
             sampler = f"{GRID}-{cells}"  # one key for each grid, however it was named
             shown, changes = f"grid {cells}³", _grid_changes(host, cells)
+    if changes is None:
+        return None
     return Contender(f"{METHOD_NAMES.get(method, method)} + {shown}", method, sampler, changes)
 
 
@@ -327,6 +329,7 @@ def _switch(sampler: str) -> Contender:
 
 
 SCENE_SIZED = _empty_mlp(SCENE_LAYERS)
+OTHER_GATES = {"hash": "hash grid", "vm": "TensoRF planes", "k-planes": "K-planes"}
 
 SUITES = {
     "representations": Suite(
@@ -334,14 +337,8 @@ SUITES = {
         (
             replace(_leco("MLP on frequencies (ours)"), grids=MADE_GRIDS, taught=True),
             *(
-                Contender(
-                    name, "leco-occupancy", f"{LEARNED}-{kind}", {"sizes.gate.encoding.kind": kind}
-                )
-                for kind, name in (
-                    ("hash", "hash grid"),
-                    ("vm", "TensoRF planes"),
-                    ("k-planes", "K-planes"),
-                )
+                replace(_leco(name, sizes__gate__encoding__kind=kind), sampler=f"{LEARNED}-{kind}")
+                for kind, name in OTHER_GATES.items()
             ),
         ),
     ),

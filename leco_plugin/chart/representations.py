@@ -44,7 +44,7 @@ class Held(NamedTuple):
 
 @dataclass(frozen=True)
 class Representation:
-    """One way to represent an occupancy, in all runs; its figures are medians over seeds."""
+    """One way to represent an occupancy, in all runs."""
 
     name: str
     by_seed: Mapping[int, Held]
@@ -65,11 +65,9 @@ class Representation:
         return [getattr(held, figure) for held in self.by_seed.values()]
 
     def has(self, figure: str) -> bool:
-        """Whether it was measured."""
         return None not in self.of_seeds(figure)
 
     def median(self, figure: str) -> float:
-        """The same, over seeds."""
         return statistics.median(self.of_seeds(figure))
 
     @property

@@ -14,16 +14,15 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from leco_plugin.evaluation.report import read_object
 from leco_plugin.scenes.input_error import InputError, one_line
-from leco_plugin.scenes.whole_files import LOCK, alone_in, write_json, writing_into
+from leco_plugin.scenes.whole_files import LOCK, write_json, writing_into
 
 if TYPE_CHECKING:
     from leco_plugin.chart.contender import Job
@@ -60,32 +59,23 @@ class RunFolder:
         for name in (RUNS, UNFINISHED, LOGS):
             (path / name).mkdir(exist_ok=True)
 
-    @contextmanager
-    def alone(self) -> Iterator[None]:
-        """Keeps other processes from making jobs here, and deletes what killed ones left. Another
-        process that makes some is an `InputError`."""
-        with alone_in(self.path, "chart"):
-            self.clear()
-            yield
-
     def clear(self) -> None:
         """Deletes what killed processes left. Only for the process that alone makes jobs here."""
         shutil.rmtree(self.path / UNFINISHED, ignore_errors=True)
         (self.path / UNFINISHED).mkdir(exist_ok=True)
 
     def stored(self) -> dict[str, dict[str, Any]]:
-        """Records of finished jobs by name: the values of the job, `run` and what was noted."""
         return stored_in(self.path)
 
     def store(self, job: Job, run: Mapping[str, Any], **noted: Any) -> None:
         """Keeps the result of a job, whole or not at all."""
-        record = {**job.values, "run": dict(run), **noted}
+        record = {**asdict(job), "run": dict(run), **noted}
         write_json(self.path / RUNS / f"{job.name}.json", record)
         (self.path / LOGS / f"{job.name}.json").unlink(missing_ok=True)
 
     def fail(self, job: Job, reason: str) -> None:
         """Notes why a job has no result, until it is made again."""
-        write_json(self.path / LOGS / f"{job.name}.json", {**job.values, "reason": reason})
+        write_json(self.path / LOGS / f"{job.name}.json", {**asdict(job), "reason": reason})
 
     def failures(self) -> list[dict[str, Any]]:
         """Jobs without a result: their values, the `reason`, and the name of the `job`."""
@@ -94,7 +84,8 @@ class RunFolder:
 
 
 def stored_in(path: Path) -> dict[str, dict[str, Any]]:
-    """The records in a folder by the names of their jobs; a damaged one is an `InputError`."""
+    """Records of finished jobs in a folder, by name: the values of the job, `run` and what was
+    noted. A damaged one is an `InputError`."""
     found = {}
     for file in sorted((path / RUNS).glob("*.json")):
         record = read_object(file, DAMAGED)
@@ -244,7 +235,7 @@ class ProcessRunner:
         """
         place = self.folder.path
         work = Path(tempfile.mkdtemp(prefix=f"{job.name}-", dir=place / UNFINISHED))
-        write_json(work / JOB, job.values | self.shared)
+        write_json(work / JOB, asdict(job) | self.shared)
         log = place / LOGS / f"{job.name}.log"
         status = self._wait_for(work, log, show)
         if not (work / RESULT).exists():

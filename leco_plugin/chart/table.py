@@ -86,15 +86,28 @@ def spread(
     values: Sequence[float | None],
     form: str,
     middle_of: Callable[[Sequence[float]], float] = statistics.median,
+    is_bound: Sequence[bool] = (),
+    sign: str = "",
 ) -> str:
-    """Median or mean, and the range where there are several; a dash where a seed has none."""
+    """Median or mean, and the range where there are several; a dash where a seed has none. Where
+    some values are bounds, a sign stands before each figure that may be less ("≤") or more ("≥").
+    """
     known = [value for value in values if value is not None]
     if len(known) < len(values) or not known:
         return "-"
-    middle = format(middle_of(known), form)
+    bounds = [value for value, bound in zip(known, is_bound) if bound]
+    middle = statistics.median_high if sign == "≥" else statistics.median_low
+    said = _marked(format(middle_of(known), form), middle(known), bounds, sign)
     if len(known) == 1:
-        return middle
-    return f"{middle} ({min(known):{form}} to {max(known):{form}})"
+        return said
+    ends = (_marked(format(end, form), end, bounds, sign) for end in (min(known), max(known)))
+    return f"{said} ({' to '.join(ends)})"
+
+
+def _marked(said: str, value: float, bounds: Sequence[float], sign: str) -> str:
+    """A figure with the sign, if the true value behind a bound may be on its other side."""
+    is_open = any(bound >= value if sign == "≤" else bound <= value for bound in bounds)
+    return f"{sign} {said}" if is_open else said
 
 
 def table(results: Mapping[str, Any]) -> str:
@@ -178,44 +191,20 @@ def _seconds_to(psnr: float, line: Line) -> str:
     return _marked(said, statistics.median_low(known), bounds, "≤")
 
 
-def bounded_spread(
-    values: Sequence[float | None], form: str, is_bound: Sequence[bool], sign: str
-) -> str:
-    """As `spread`. Where some values are bounds, a sign stands before each figure that may be less
-    ("≤") or more ("≥")."""
-    said = spread(values, form)
-    known = [value for value in values if value is not None]
-    bounds = [value for value, bound in zip(values, is_bound) if value is not None and bound]
-    if said == "-" or not bounds:
-        return said
-    middle = statistics.median_low if sign == "≤" else statistics.median_high
-    found = _marked(format(statistics.median(known), form), middle(known), bounds, sign)
-    if len(known) == 1:
-        return found
-    least, most = (
-        _marked(format(end, form), end, bounds, sign) for end in (min(known), max(known))
-    )
-    return f"{found} ({least} to {most})"
-
-
-def _marked(said: str, value: float, bounds: Sequence[float], sign: str) -> str:
-    """A figure with the sign, if the true value behind a bound may be on its other side."""
-    is_open = any(bound >= value if sign == "≤" else bound <= value for bound in bounds)
-    return f"{sign} {said}" if is_open else said
-
-
 def versus_table(duels: Sequence[Versus]) -> str:
     """What learned occupancies gain: the verdict on PSNR, medians of times and of ratios, and the
     least and the most."""
+
+    def bounded(values: Sequence[float | None], form: str, duel: Versus, sign: str) -> str:
+        return spread(values, form, is_bound=duel.at_first, sign=sign)
+
     return table_of(
         duels,
         {
             "against": lambda duel: f"{duel.ours} against {duel.theirs}",
             "PSNR": lambda duel: duel.psnr.said(),
-            "passes its last PSNR after, s": lambda duel: bounded_spread(
-                duel.passed, ".0f", duel.at_first, "≤"
-            ),
-            "sooner by, x": lambda duel: bounded_spread(duel.sooner, ".2f", duel.at_first, "≥"),
+            "passes its last PSNR after, s": lambda duel: bounded(duel.passed, ".0f", duel, "≤"),
+            "sooner by, x": lambda duel: bounded(duel.sooner, ".2f", duel, "≥"),
             "renders faster by, x": lambda duel: spread(duel.faster, ".1f"),
         },
     )

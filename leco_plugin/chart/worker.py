@@ -16,9 +16,6 @@ if TYPE_CHECKING:
 
     from leco_plugin.chart.contender import Contender, Protocol
 
-    Make = Callable[[Contender, int, Path, Protocol, Path, Callable[[float], None]], dict[str, Any]]
-    """Makes a run of a seed on a scene, and leaves its files in a folder, as `run_job`."""
-
 WORKER = (sys.executable, "-W", "ignore", "-m", "leco_plugin.chart.worker")
 SMALL_GATES = {
     "MLP": "frequency-6-32-2",
@@ -33,16 +30,9 @@ BYTES_A_POINT = 6
 """Its three numbers in half precision."""
 
 
-def run_job(
-    contender: Contender,
-    seed: int,
-    data: Path,
-    protocol: Protocol,
-    folder: Path,
-    on_progress: Callable[[float], None] | None = None,
-) -> dict[str, Any]:
-    """Trains, evaluates and measures; the record as JSON values. Arguments as of `train_job`."""
-    return train_job(contender, seed, data, protocol, folder, on_progress)[0]
+def run_job(*job: Any) -> dict[str, Any]:
+    """The record of `train_job`, which takes the same arguments."""
+    return train_job(*job)[0]
 
 
 def train_job(
@@ -112,17 +102,20 @@ def _at_freezing(
     model: Any = trainer.pipeline.model
     mixture = model.mixture
     now, small = _weights_of(mixture), mixture.small
+
+    def load(found: dict[str, Any]) -> None:
+        for name, weights in found.items():
+            getattr(mixture, name).load_state_dict(weights)
+
     mixture.small = None
-    for name, weights in frozen.items():
-        getattr(mixture, name).load_state_dict(weights)
+    load(frozen)
     try:
         return compare_at_freezing(model, trainer.pipeline.datamanager, contender)
     except ValueError as error:  # the run itself is whole
         print(error)
         return None
     finally:
-        for name, weights in now.items():
-            getattr(mixture, name).load_state_dict(weights)
+        load(now)
         mixture.small = small
 
 
@@ -150,17 +143,17 @@ def compare_at_freezing(model: Any, datamanager: Any, contender: Contender) -> d
 
     known = {gate.key: gate for gate in gates()}
     clock = Clock()
-    with clock.running(), evaluating(model):
-        lesson = lesson_of(datamanager, model)
-    of_lesson = clock.seconds
+    clock.start()
+    with evaluating(model):
+        lesson = lesson_of(Source(datamanager, model), model.config.gate_loss)
+    of_lesson = clock.stop()
     scores: dict[str, Any] = {}
     rows: dict[str, list[dict[str, Any]]] = {"taught": [], "others": []}
 
     def add(kind: str, name: str, make: Callable[[], Any], before: float, **facts: Any) -> None:
-        clock = Clock()
-        with clock.running():
-            scores[name] = make()
-        rows[kind].append({"name": name, "seconds": round(before + clock.seconds, 2), **facts})
+        clock.start()
+        scores[name] = make()
+        rows[kind].append({"name": name, "seconds": round(before + clock.stop(), 2), **facts})
 
     for name, key in SMALL_GATES.items():
         config = known[key].gate
@@ -184,7 +177,7 @@ def compare_at_freezing(model: Any, datamanager: Any, contender: Contender) -> d
     return found | rows
 
 
-def main(folder: Path, run: Make = run_job) -> int:
+def main(folder: Path, run: Callable[..., dict[str, Any]] = run_job) -> int:
     """Makes the run that a folder describes, by a function as `run_job`; 0, or 1 on failure."""
     from leco_plugin.chart.contender import Contender, Protocol
     from leco_plugin.evaluation.clock import seconds_now

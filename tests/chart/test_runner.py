@@ -41,8 +41,8 @@ def test_what_a_killed_process_left_is_no_run_and_is_cleared(tmp_path: Path) -> 
     left.mkdir()
     again = RunFolder(tmp_path, SETTINGS)
     assert again.stored() == {} and left.exists()  # of another process, for all it knows
-    with again.alone():
-        assert not left.exists()
+    again.clear()
+    assert not left.exists()
 
 
 @pytest.mark.parametrize(

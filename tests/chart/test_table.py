@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from chart_results import occupancy, results, run
 
-from leco_plugin.chart.table import bounded_spread, spread, table
+from leco_plugin.chart.table import spread, table
 
 FAILURE = {"name": "B", "method": "b", "sampler": "own", "seed": 1, "reason": "a | b"}
 
@@ -56,10 +56,10 @@ def test_what_is_passed_by_the_first_evaluation_was_passed_then_at_the_latest() 
 
 def test_a_bound_below_the_median_leaves_it_as_it_is() -> None:
     bounds = [True, False, False]
-    assert bounded_spread([1.0, 2.0, 3.0], ".0f", bounds, "≤") == "2 (≤ 1 to 3)"
-    assert bounded_spread([3.0, 2.0, 1.0], ".0f", bounds, "≤") == "≤ 2 (≤ 1 to ≤ 3)"
-    assert bounded_spread([3.0, 2.0, 1.0], ".0f", bounds, "≥") == "2 (1 to ≥ 3)"
-    assert bounded_spread([3.0, None, 1.0], ".0f", bounds, "≤") == "-"
+    assert spread([1.0, 2.0, 3.0], ".0f", is_bound=bounds, sign="≤") == "2 (≤ 1 to 3)"
+    assert spread([3.0, 2.0, 1.0], ".0f", is_bound=bounds, sign="≤") == "≤ 2 (≤ 1 to ≤ 3)"
+    assert spread([3.0, 2.0, 1.0], ".0f", is_bound=bounds, sign="≥") == "2 (1 to ≥ 3)"
+    assert spread([3.0, None, 1.0], ".0f", is_bound=bounds, sign="≤") == "-"
 
 
 def test_the_front_of_a_column_is_bold() -> None:

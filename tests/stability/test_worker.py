@@ -74,7 +74,7 @@ def nothing_reads_the_input(monkeypatch: pytest.MonkeyPatch) -> None:
 def run(contender: Contender, scene: Path, folder: Path) -> dict[str, Any]:
     folder.mkdir()
     shared = {"data": str(scene), "protocol": asdict(Protocol(steps=MICRO.steps))}
-    write_json(folder / JOB, Job(contender, 0).values | shared)
+    write_json(folder / JOB, asdict(Job(contender, 0)) | shared)
     assert worker.main(folder, run_cell) == 0
     record: dict[str, Any] = json.loads((folder / RESULT).read_text())
     assert (folder / PROGRESS).read_text() == "1.000"
