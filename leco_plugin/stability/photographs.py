@@ -28,9 +28,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from leco_plugin.scenes.city.cameras import Lens, look_at
-from leco_plugin.scenes.city.folder import POINTS, TRANSFORMS
+from leco_plugin.scenes.city.folder import POINTS, TRANSFORMS, frame_of, transforms_of
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.whole_files import write_points
+from leco_plugin.scenes.whole_files import write_json, write_points
 from leco_plugin.stability.scene import (
     Array,
     Ball,
@@ -326,21 +326,11 @@ def _take_pictures(stage: Stage, capture: Capture, folder: Path) -> None:
         clouds.append(
             view.lens.some_points(shot.written, view.depth, seen.image, POINTS_PER_VIEW, random)
         )
-        lens, matrix = view.lens, [*shot.written.tolist(), [0.0, 0.0, 0.0, 1.0]]
-        size = {"w": lens.width, "h": lens.height, "cx": lens.width / 2, "cy": lens.height / 2}
-        focal = {"fl_x": lens.focal, "fl_y": lens.focal}
-        frames.append({"file_path": shot.file, "transform_matrix": matrix, **size, **focal})
+        frames.append(frame_of(shot.written, file_path=shot.file, **view.lens.intrinsics))
+    facts = {"orientation_override": "none"}
     places, colours = map(np.concatenate, zip(*clouds))
     if len(places):
         write_points(folder / POINTS, places, colours)
-    held_out = [shot.file for shot, _, _ in taken if shot.held_out]
-    transforms = {
-        "camera_model": "OPENCV",
-        "orientation_override": "none",
-        **({"ply_file_path": POINTS} if len(places) else {}),
-        "frames": frames,
-        "train_filenames": [shot.file for shot, _, _ in taken if not shot.held_out],
-        "val_filenames": held_out,
-        "test_filenames": held_out,
-    }
-    (folder / TRANSFORMS).write_text(json.dumps(transforms, indent=1) + "\n")
+        facts["ply_file_path"] = POINTS
+    held_out = [shot.file for shot in shots if shot.held_out]
+    write_json(folder / TRANSFORMS, transforms_of(facts, frames, held_out), indent=1)

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leco_plugin.scenes.city.cameras import QUINCUNX, Lens
-from leco_plugin.scenes.city.render import SUN
+from leco_plugin.scenes.city.shapes import Array, dot
 
-Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
 _TINY = 1e-9
 _SHADE = 0.45
@@ -80,7 +79,7 @@ class Ball:
     def meet(self, origins: Array, directions: Array) -> tuple[Array, Array]:
         """As of `Box`."""
         offsets = origins - np.array(self.centre)
-        t = _first_root(_dot(offsets, directions), _dot(offsets, offsets) - self.radius**2)
+        t = _first_root(dot(offsets, directions), dot(offsets, offsets) - self.radius**2)
         return t, _points(offsets, t, directions) / self.radius
 
 
@@ -101,9 +100,9 @@ class Rod:
         offsets = origins - start
         across = directions - np.outer(directions @ axis, axis)
         beside = offsets - np.outer(offsets @ axis, axis)
-        slope = np.maximum(_dot(across, across), _TINY)
-        rest = (_dot(beside, beside) - self.radius**2) / slope
-        t = _first_root(_dot(beside, across) / slope, rest)
+        slope = np.maximum(dot(across, across), _TINY)
+        rest = (dot(beside, beside) - self.radius**2) / slope
+        t = _first_root(dot(beside, across) / slope, rest)
         places = _points(offsets, t, directions)
         height = places @ axis
         t = np.where((height >= 0.0) & (height <= length), t, np.inf)
@@ -111,11 +110,6 @@ class Rod:
 
 
 Shape = Box | Ball | Rod
-
-
-def _dot(one: Array, other: Array) -> Array:
-    """Products [N] of vectors [N, 3]."""
-    return np.einsum("nk,nk->n", one, other)
 
 
 def _points(origins: Array, t: Array, directions: Array) -> Array:

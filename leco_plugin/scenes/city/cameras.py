@@ -90,6 +90,12 @@ class Lens:
     height: int
     focal: float
 
+    @property
+    def intrinsics(self) -> dict[str, float]:
+        """As transforms.json has them."""
+        size = {"w": self.width, "h": self.height, "fl_x": self.focal, "fl_y": self.focal}
+        return {**size, "cx": self.width / 2, "cy": self.height / 2}
+
     def directions(self, offset: tuple[float, float] = (0.5, 0.5)) -> Array:
         """Unit directions [height, width, 3], OpenGL axes, through a place in each pixel."""
         rows, columns = np.mgrid[: self.height, : self.width]

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leco_plugin.scenes.city.plan import centres, choose_blocks, plan_city
-from leco_plugin.scenes.city.shapes import Array, Shapes
+from leco_plugin.scenes.city.shapes import Array, Shapes, dot
 from leco_plugin.scenes.input_error import one_line
 
 Indices = NDArray[np.int64]
@@ -100,10 +100,10 @@ class Faces:
         middle, radius = (low + high) / 2, np.linalg.norm(high - low) / 2
         bounds = self.bounds[candidates]
         least = np.maximum(np.maximum(bounds[:, 0] - middle, middle - bounds[:, 1]), 0)
-        least = np.sqrt(_dot(least, least))
+        least = np.sqrt(dot(least, least))
         first = np.searchsorted(candidates, self.first)
         most = np.maximum(bounds[first:, 1] - middle, middle - bounds[first:, 0])
-        reach = np.sqrt(_dot(most, most).min(initial=np.inf))
+        reach = np.sqrt(dot(most, most).min(initial=np.inf))
         reach = min(reach, least[:first].min(initial=np.inf)) + 2 * radius
         return candidates[least <= reach * (1 + 1e-9)]
 
@@ -131,26 +131,22 @@ def squared_to_triangles(points: Array, triangles: Array) -> Array:
     alone, as of the GPU suite, lacks trimesh, which could do this."""
     start, away = triangles[:, 0], points - triangles[:, 0]
     u, v = triangles[:, 1] - start, triangles[:, 2] - start
-    uu, uv, vv = _dot(u, u), _dot(u, v), _dot(v, v)
-    pu, pv = _dot(away, u), _dot(away, v)
+    uu, uv, vv = dot(u, u), dot(u, v), dot(v, v)
+    pu, pv = dot(away, u), dot(away, v)
     area = uu * vv - uv**2
     b, c = (vv * pu - uv * pv) / area, (uu * pv - uv * pu) / area
     over = (b >= 0) & (c >= 0) & (b + c <= 1)
     height = away - b[:, None] * u - c[:, None] * v
-    squared = np.where(over, _dot(height, height), np.inf)
+    squared = np.where(over, dot(height, height), np.inf)
     third, from_second = v - u, away - u
     for offset, edge, along in (
         (away, u, pu / uu),
         (away, v, pv / vv),
-        (from_second, third, _dot(from_second, third) / _dot(third, third)),
+        (from_second, third, dot(from_second, third) / dot(third, third)),
     ):
         rest = offset - np.clip(along, 0, 1)[:, None] * edge
-        squared = np.minimum(squared, _dot(rest, rest))
+        squared = np.minimum(squared, dot(rest, rest))
     return squared
-
-
-def _dot(a: Array, b: Array) -> Array:
-    return np.einsum("mk,mk->m", a, b)
 
 
 DESCRIPTION = "city.json"

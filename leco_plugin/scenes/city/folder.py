@@ -38,6 +38,7 @@ import leco_plugin
 from leco_plugin.log import for_each
 from leco_plugin.scenes.city.cameras import CaptureConfig, Lens, View, views_of
 from leco_plugin.scenes.city.city import DESCRIPTION, City, CityConfig, read_description
+from leco_plugin.scenes.city.shapes import Array
 from leco_plugin.scenes.frames import inverse, moved, parsed_frame
 from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.mega_nerf_files import (
@@ -113,31 +114,31 @@ class NerfstudioLayout(Layout):
             found.append(self.lens.some_points(view.pose, depth, image, most, random))
         places, colours = map(np.concatenate, zip(*found))
         write_points(folder / POINTS, places, colours)
-        write_json(folder / TRANSFORMS, self._transforms(), indent=1)
+        as_written = {"orientation_override": "none", "ply_file_path": POINTS}
+        facts = {**self.lens.intrinsics, **as_written, "metres_per_unit": 1.0}
+        frames = [
+            frame_of(view.pose, **dict(zip(FILE_FIELDS, self.files(view)))) for view in self.views
+        ]
+        held_out = [self.files(view)[0] for view in self.views if view.held_out]
+        write_json(folder / TRANSFORMS, transforms_of(facts, frames, held_out), indent=1)
 
-    def _transforms(self) -> dict[str, Any]:
-        frames: list[dict[str, Any]] = []
-        for view in self.views:
-            matrix = [*view.pose.tolist(), [0.0, 0.0, 0.0, 1.0]]
-            frames.append(dict(zip(FILE_FIELDS, self.files(view))) | {"transform_matrix": matrix})
-        pictures = [(self.files(view)[0], view.held_out) for view in self.views]
-        tested, lens = [name for name, held_out in pictures if held_out], self.lens
-        return {
-            "camera_model": "OPENCV",
-            "w": lens.width,
-            "h": lens.height,
-            "fl_x": lens.focal,
-            "fl_y": lens.focal,
-            "cx": lens.width / 2,
-            "cy": lens.height / 2,
-            "orientation_override": "none",
-            "ply_file_path": POINTS,
-            "metres_per_unit": 1.0,
-            "frames": frames,
-            "train_filenames": [name for name, held_out in pictures if not held_out],
-            "val_filenames": tested,
-            "test_filenames": tested,
-        }
+
+def frame_of(pose: Array, **facts: Any) -> dict[str, Any]:
+    """A picture of transforms.json, with its files, from a pose [3, 4]."""
+    return {**facts, "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]}
+
+
+def transforms_of(
+    facts: dict[str, Any], frames: list[dict[str, Any]], held_out: list[str]
+) -> dict[str, Any]:
+    """A transforms.json: facts of all pictures, their frames, and which files are for testing."""
+    names, tested = [frame["file_path"] for frame in frames], set(held_out)
+    splits = {
+        "train_filenames": [name for name in names if name not in tested],
+        "val_filenames": held_out,
+        "test_filenames": held_out,
+    }
+    return {"camera_model": "OPENCV", **facts, "frames": frames, **splits}
 
 
 class MegaNerfLayout(Layout):
@@ -152,10 +153,9 @@ class MegaNerfLayout(Layout):
         return [f"{split}/{part}/{stem}.{ending}" for part, ending in PARTS]
 
     def write(self, folder: Path, view: View, image: Image8, depth: NDArray[np.float32]) -> None:
-        lens = self.lens
-        intrinsics = lens.focal, lens.focal, lens.width / 2, lens.height / 2
+        fx, fy, cx, cy = (self.lens.intrinsics[name] for name in ("fl_x", "fl_y", "cx", "cy"))
         pose = self.coordinates.to_file(view.pose[None])[0]
-        write_view(folder, *self._place(view), image, pose, intrinsics)
+        write_view(folder, *self._place(view), image, pose, (fx, fy, cx, cy))
 
     def finish(self, folder: Path) -> None:
         write_coordinates(folder, self.coordinates)

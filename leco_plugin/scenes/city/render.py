@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from leco_plugin.scenes.city.cameras import QUINCUNX, Lens
 from leco_plugin.scenes.city.city import City
-from leco_plugin.scenes.city.shapes import STOREY, Array, Material
+from leco_plugin.scenes.city.shapes import STOREY, Array, Material, dot
 
 Colours = NDArray[np.float32]
 Spacing = Array | float
@@ -176,8 +176,8 @@ class Tracer:
         # The ray tracer works in single precision; the plane of the face gives the exact depth.
         normals = self.normals[faces[hit]]
         offsets = self.city.triangles[faces[hit], 0] - origins[hit]
-        slant = np.einsum("nk,nk->n", normals, directions[hit])
-        height = np.einsum("nk,nk->n", normals, offsets)
+        slant = dot(normals, directions[hit])
+        height = dot(normals, offsets)
         depths[hit] = height / np.where(np.abs(slant) < 1e-12, 1e-12, slant)
         return faces, depths
 
@@ -192,7 +192,7 @@ class Tracer:
             return colours, depths
         positions = origins[hit] + depths[hit, None] * directions[hit]
         normals = self.normals[faces[hit]]
-        slant = np.abs(np.einsum("nk,nk->n", normals, directions[hit]))
+        slant = np.abs(dot(normals, directions[hit]))
         pixel = depths[hit] * angle / np.sqrt(np.maximum(slant, 0.05))
         albedo = paint_surface(self.city, positions, normals, self.city.paint[faces[hit]], pixel)
         sunlit = np.maximum(normals @ SUN, 0).astype(np.float32)

@@ -34,6 +34,11 @@ def rounded(bounds: Rectangle) -> Rectangle:
     return x0, x1, y0, y1
 
 
+def dot(one: Array, other: Array) -> Array:
+    """Products [N] of vectors [N, 3]."""
+    return np.einsum("nk,nk->n", one, other)
+
+
 @dataclass
 class Shapes:
     """What has been built so far, in metres, +z up. `paint` numbers index the city's palette."""
@@ -52,7 +57,7 @@ class Shapes:
         first, second, third = np.moveaxis(corners[[face[:3] for face in faces]], 1, 0)
         normals = np.cross(second - first, third - first)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        offsets = np.einsum("hk,hk->h", normals, first)
+        offsets = dot(normals, first)
         flip = np.where(normals @ corners.mean(0) > offsets, -1.0, 1.0)
         self.hulls.append((corners, np.column_stack([normals, offsets]) * flip[:, None]))
 
