@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -60,10 +60,11 @@ def chart(
         json: Another file for the results.
     """
     check_report(json, data)
-    from leco_plugin.chart.command import Asked, make_charts, refuse_failures
+    from leco_plugin.chart.command import make_charts, refuse_failures
 
-    asked = Asked(seconds, steps, learn_seconds, seeds, images, at_once, reuse, held_out)
-    made = make_charts(data, out, methods, samplers, suite, asked)
+    asked: dict[str, Any] = {"seconds": seconds, "steps": steps, "learn_seconds": learn_seconds}
+    asked |= {"images": images, "at_once": at_once, "held_out": held_out}
+    made = make_charts(data, out, methods, samplers, suite, seeds, reuse, asked)
     for folder, results in made.items():
         drawn = "chart.png, chart.html, " if results["runs"] else ""
         print(f"see {drawn}table.md and results.json in {folder}")

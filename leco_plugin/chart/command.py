@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,28 +15,9 @@ from leco_plugin.chart.runner import ProcessRunner, Runner
 from leco_plugin.chart.worker import WORKER
 from leco_plugin.log import bar, counted, put, resumable
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.scenes.photographs import HeldOut
 
 LEFT_BY_SYSTEMS = (".DS_Store", "Thumbs.db")
 """Files in folders that somebody has looked into."""
-
-
-@dataclass(frozen=True)
-class Asked:
-    """The options of `leco chart` beside what is compared; None where a suite has its own."""
-
-    seconds: float | None = None
-    steps: int | None = None
-    learn_seconds: float | None = None
-    seeds: Sequence[int] = (0, 1, 2)
-    images: int = 2
-    """Whole test images rendered by each run."""
-    at_once: int | None = None
-    """Runs at a time; None is one, or as a suite has it."""
-    reuse: Sequence[Path] = ()
-    """Folders of other charts on this scene, whose runs need not be made again."""
-    held_out: HeldOut = "spread"
-    """Which photographs are tested."""
 
 
 def processes(chart: Chart) -> Runner:
@@ -47,10 +28,12 @@ def processes(chart: Chart) -> Runner:
 def make_charts(
     data: Path,
     out: Path,
-    methods: Sequence[str] = (),
-    samplers: Sequence[str] = (),
-    suites: Sequence[str] = (),
-    asked: Asked = Asked(),
+    methods: Sequence[str],
+    samplers: Sequence[str],
+    suites: Sequence[str],
+    seeds: Sequence[int],
+    reuse: Sequence[Path],
+    asked: Mapping[str, Any],
     runner_for: Callable[[Chart], Runner] = processes,
 ) -> dict[Path, dict[str, Any]]:
     """Makes what is missing of one chart, or of those of several suites, and draws it.
@@ -58,6 +41,8 @@ def make_charts(
     Args:
         out: the chart's folder; several suites have one each in it, and reuse each other's runs.
         suites: names of comparisons, or `all`; in place of methods and samplers.
+        reuse: folders of other charts on this scene, whose runs need not be made again.
+        asked: fields of `Protocol`; None where a suite may have its own.
         runner_for: gives what makes the runs of a chart.
     Returns:
         The results by folder, as in `results.json`.
@@ -68,16 +53,16 @@ def make_charts(
         raise InputError("a suite has methods of its own: give --suite or --methods, not both")
     names = in_order(suites)
     if len(names) > 1:
-        if asked.reuse:
+        if reuse:
             raise InputError("several suites share their runs by themselves: --reuse is for one")
         _check_shared(out)
-        charts = [_chart_of(data, out / name, asked, name) for name in names]
+        charts = [_chart_of(data, out / name, name, (), (), seeds, (), asked) for name in names]
         for chart in charts:
             others = [out / other for other in SUITES if other != chart.suite]
             chart.reuse = [other for other in others if not why_not_shared(other, chart.settings)]
     else:
         name = names[0] if names else None
-        charts = [_chart_of(data, out, asked, name, methods, samplers)]
+        charts = [_chart_of(data, out, name, methods, samplers, seeds, reuse, asked)]
     return {chart.folder.path: _make(chart, runner_for) for chart in charts}
 
 
@@ -108,31 +93,29 @@ def _check_shared(out: Path) -> None:
 def _chart_of(
     data: Path,
     out: Path,
-    asked: Asked,
     name: str | None,
-    methods: Sequence[str] = (),
-    samplers: Sequence[str] = (),
+    methods: Sequence[str],
+    samplers: Sequence[str],
+    seeds: Sequence[int],
+    reuse: Sequence[Path],
+    asked: Mapping[str, Any],
 ) -> Chart:
     suite = SUITES[name] if name is not None else None
     compared = suite.contenders if suite else contenders(methods, samplers)
-    usual = suite.protocol.at_once if suite else 1
-    at_once = usual if asked.at_once is None else asked.at_once
-    learn_seconds, times = asked.learn_seconds, (asked.seconds, asked.steps)
-    if suite and times == (None, None):
-        times = suite.protocol.seconds, suite.protocol.steps
-        learn_seconds = suite.learn_seconds if learn_seconds is None else learn_seconds
-    protocol = Protocol(
-        *times, learn_seconds, asked.images, at_once=at_once, held_out=asked.held_out
-    )
+    given = {name: value for name, value in asked.items() if value is not None}
+    usual = asdict(suite.protocol) if suite else {}
+    if not given.keys().isdisjoint(("seconds", "steps")):
+        usual |= dict.fromkeys(("seconds", "steps", "learn_seconds"))
+    protocol = Protocol(**usual | given)
     options = {"suite": name, **asdict(protocol), "methods": methods, "samplers": samplers}
     del options["curve_points"]
-    if asked.held_out == "spread":
+    if protocol.held_out == "spread":
         del options["held_out"]
-    if not suite and at_once == 1:
+    if not suite and protocol.at_once == 1:
         del options["at_once"]
-    command = command_line(data, {**options, "seeds": asked.seeds})
+    command = command_line(data, {**options, "seeds": seeds})
     titled = name, suite.question if suite else None
-    return Chart(data, out, compared, asked.seeds, protocol, titled, command, asked.reuse)
+    return Chart(data, out, compared, seeds, protocol, titled, command, reuse)
 
 
 def _make(chart: Chart, runner_for: Callable[[Chart], Runner]) -> dict[str, Any]:

@@ -183,15 +183,10 @@ SEEDS = 1 << 32
 
 
 @dataclass(frozen=True)
-class Protocol:
-    """Training time or steps, and what is evaluated: the same for all runs of a chart."""
+class Protocol(Budget):
+    """Time or steps of a run, of which learning an occupancy has a share of its own by default, and
+    what is evaluated: the same for all runs of a chart."""
 
-    seconds: float | None = None
-    """Training time of a run."""
-    steps: int | None = None
-    """Training steps of a run; the run ends with the first of the two."""
-    learn_seconds: float | None = None
-    """Limit, about, for learning an occupancy; None is a share of `seconds`."""
     images: int = 2
     """Whole test images rendered at the end."""
     curve_points: int = 6
@@ -202,7 +197,7 @@ class Protocol:
     """Which photographs are tested."""
 
     def __post_init__(self) -> None:
-        self.budget()
+        super().__post_init__()
         if self.seconds and self.learn_seconds and self.learn_seconds >= self.seconds:
             raise ValueError(
                 f"learning an occupancy may take {self.learn_seconds:g} s of a run of "
@@ -215,7 +210,7 @@ class Protocol:
                 raise ValueError(f"at least one of the {name} is needed, not {count}")
 
     def budget(self) -> Budget:
-        """When a run is over; `ValueError` for a time or a number of steps that is not positive."""
+        """When a run is over, and its learning."""
         learning = self.learn_seconds
         if learning is None and self.seconds is not None:
             learning = LEARN_SHARE * self.seconds

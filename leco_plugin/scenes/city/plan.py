@@ -194,20 +194,17 @@ def _edge(
     """Aprons of irregular depth wherever a block has no neighbour: the outline of the city."""
     verge = palette.add(Material.GRASS, (0.45, 0.46, 0.24))
     earth = palette.add(Material.EARTH, (0.46, 0.36, 0.26))
-    padded = np.pad(built, 1)
-
-    def there(cell: Array) -> bool:
-        i, j = np.clip(cell + 1, 0, len(built) + 1).astype(int)
-        return bool(padded[i, j])
+    cells = np.argwhere(built).astype(float)
+    there = set(map(tuple, cells))
 
     def depth(cell: Array, corner: Array) -> float:
         # The same corner seen from both its edges must get the same depth: key by place.
         key = np.rint(np.concatenate([cell * 12, corner * 12]) + 1200).astype(int)
         return float(np.random.default_rng([seed, 4, *key]).uniform(2.5, 9.0)) * min(1.0, size / 40)
 
-    for cell in np.argwhere(built).astype(float):
+    for cell in cells:
         for out in np.array([[1, 0], [0, 1], [-1, 0], [0, -1]], float):
-            if there(cell + out):
+            if tuple(cell + out) in there:
                 continue
             along = np.array([-out[1], out[0]])
             inner, outer = [], []
@@ -215,9 +212,9 @@ def _edge(
                 node, step, owner = cell + 0.5 * out + part * along, out, cell * 0
                 if abs(part) == 0.5:
                     side = 2 * part * along
-                    if there(cell + out + side):
+                    if tuple(cell + out + side) in there:
                         step, owner = out - side, cell + out
-                    elif not there(cell + side):
+                    elif tuple(cell + side) not in there:
                         step, owner = out + side, cell
                 inner.append(node)
                 outer.append(node + step * depth(owner, node) / size)
