@@ -120,15 +120,15 @@ def bytes_kept(sizes: Sizes, guided: bool) -> int:
     return field + (0 if guided else gate)
 
 
-def training_table(sizes: Sizes = PAPER, rays: int = 1024) -> str:
-    """A step of the paper's sizes, dense and guided at the same candidates."""
-    candidates = rays * sizes.candidates
-    dense = step_of(sizes, candidates, 0, guided=False)
+def training_table() -> str:
+    """A step of the paper's sizes, dense and guided at the same candidates of 1024 rays."""
+    candidates = 1024 * PAPER.candidates
+    dense = step_of(PAPER, candidates, 0, guided=False)
     head = "| step | Tflop | activations | " + " | ".join(f"floor, {card}" for card in CARDS)
     lines = [head + " |", "|---" * (3 + len(CARDS)) + "|"]
     rows = {"dense": dense}
     rows |= {
-        f"guided, {share:.0%} kept": step_of(sizes, share * candidates, candidates, guided=True)
+        f"guided, {share:.0%} kept": step_of(PAPER, share * candidates, candidates, guided=True)
         for share in KEPT
     }
     for name, step in rows.items():
@@ -144,9 +144,9 @@ def training_table(sizes: Sizes = PAPER, rays: int = 1024) -> str:
     return "\n".join(lines)
 
 
-def sampling_table(work: Counted = COUNTED, sizes: Sizes = SMALL) -> str:
+def sampling_table(work: Counted = COUNTED) -> str:
     """The suite's rays through unbounded space, with the gate and cells and with a grid."""
-    operations = LAUNCHES * work.asked * STEPS * operations_per_position(sizes.gate)
+    operations = LAUNCHES * work.asked * STEPS * operations_per_position(SMALL.gate)
     written = BYTES_KEPT * work.kept
     moved = LAUNCHES * BYTES_OF_RAY * work.rays + written + work.cell_bytes
     lines = [

@@ -14,13 +14,13 @@ SHELL = 0.03
 """Half the thickness of what is occupied: learned occupancy keeps surfaces, not what is inside."""
 
 
-def fit_occupancy(device: str, steps: int = 300, seed: int = 0) -> Occupancy:
+def fit_occupancy(device: str, steps: int = 300) -> Occupancy:
     """A frozen occupancy whose decisions are those of a city's surfaces, as far as it can learn.
 
     The gate has the default size and is trained in the device's fastest precision on the truth,
     with the contribution loss's emphasis, so that its boundary is as rough as a learned one's.
     """
-    torch.manual_seed(seed)
+    torch.manual_seed(0)
     boxes = city(device)
     gate = Gate(GateConfig()).to(device)
     precision = fast_precision(device)
@@ -56,9 +56,9 @@ def distance(positions: Tensor, boxes: Tensor) -> Tensor:
     return torch.minimum(positions[:, 2] + 0.35, to_boxes.amin(dim=-1))
 
 
-def rays_into(space: Space, n_rays: int, seed: int = 1) -> tuple[Tensor, Tensor]:
+def rays_into(space: Space, n_rays: int) -> tuple[Tensor, Tensor]:
     """Rays of cameras above the edge of a scene that look across it, [n_rays, 3] each."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(1)
     angles = torch.rand(n_rays, generator=generator) * 2.0 * torch.pi
     origins = torch.stack(
         [0.9 * angles.cos(), 0.9 * angles.sin(), torch.full_like(angles, 0.7)], -1

@@ -111,10 +111,10 @@ def first_kept(occupancy: Occupancy, origins: Tensor, directions: Tensor) -> Ten
     return first
 
 
-def smooth(picture: Tensor, size: int = 3) -> Tensor:
-    """[C, h, w] with the mean of the pixels around each."""
-    padded = torch.nn.functional.pad(picture[None], [size // 2] * 4, mode="replicate")
-    return torch.nn.functional.avg_pool2d(padded, size, 1)[0]
+def smooth(picture: Tensor) -> Tensor:
+    """[C, h, w] with the mean of the 3 x 3 pixels around each."""
+    padded = torch.nn.functional.pad(picture[None], [1] * 4, mode="replicate")
+    return torch.nn.functional.avg_pool2d(padded, 3, 1)[0]
 
 
 def of_map(name: str, values: Tensor) -> Tensor:
