@@ -49,8 +49,6 @@ TOP, LINE_HEIGHT, SMALL_LINE_HEIGHT = 0.985, 0.04, 0.0235
 COSTS_BELOW = "What it costs. Up and left is better; nothing is better in both than the grey line."
 PSNR_BELOW = "PSNR on unseen photographs, dB, against what it costs. Up and left is better:"
 KEPT_SPACE = f"Space that must be sampled where each loses {LOST_SURFACE_MASS:.1%} of the surface"
-SIZE = "size, kB: numbers in bfloat16, grids "
-AS_OCTREES, IN_BITS = "as octrees", "in bits"
 
 
 def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
@@ -100,7 +98,7 @@ def _draw_occupancies(figure: Any, top: float, shown: Shown, theme: Theme) -> No
     """Space kept at equal loss above; curves and costs, small, below."""
     lines, (first, *others) = shown.lines, shown.space
     grids = [row for one in at_equal_loss(lines) for row in one["grids"]]
-    held = AS_OCTREES if any("octree_bytes" in row for row in grids) else IN_BITS
+    held = "as octrees" if any("octree_bytes" in row for row in grids) else "in bits"
     figure.text(0.015, 0.335, PSNR_BELOW, va="top", fontsize=11.5)
     by_psnr = first.more_x
     better = ", against PSNR. Up and right is better:" if by_psnr else ". Up and left is better:"
@@ -113,13 +111,13 @@ def _draw_occupancies(figure: Any, top: float, shown: Shown, theme: Theme) -> No
     low = 0.455 if by_psnr else 0.43
     above = [figure.add_axes((x, low, wide, top - 0.11 - low)) for x, wide in places]
     above[0].set_ylabel("space kept, %")
-    draw_panel(above[0], replace(first, title="" if by_psnr else SIZE + held), theme)
-    if first.points:
-        points = [(one.x, one.y) for one in first.points]
-        names = [one.name.replace("taught grid", "taught") for one in first.points]
-        colours = [look_of(one, theme)["color"] for one in first.points]
-        seeds = [seed for one in first.points for seed in one.seeds]
-        name_points(above[0], points, names, colours, seeds)
+    size = f"size, kB: numbers in bfloat16, grids {held}"
+    draw_panel(above[0], replace(first, title="" if by_psnr else size), theme)
+    points = [(one.x, one.y) for one in first.points]
+    names = [one.name.replace("taught grid", "taught") for one in first.points]
+    colours = [look_of(one, theme)["color"] for one in first.points]
+    seeds = [seed for one in first.points for seed in one.seeds]
+    name_points(above[0], points, names, colours, seeds)
     if by_psnr:
         above[0].set_xlabel("PSNR on unseen photographs, dB")
     for axes, by_time in zip(above[1:], others):
@@ -283,9 +281,9 @@ def name_points(
     """Writes names beside points, each where it and the line to it cover least: not `others`
     either."""
     to_panel = axes.transData + axes.transAxes.inverted()
-    taken = boxes_around(to_panel.transform([*places, *others]), *POINT)
-    written = np.zeros((0, 4))
-    for point, name, colour in zip(to_panel.transform(places), names, colours):
+    of_points = to_panel.transform(np.reshape([*places, *others], (-1, 2)))
+    taken, written = boxes_around(of_points, *POINT), np.zeros((0, 4))
+    for point, name, colour in zip(of_points, names, colours):
         found = _places_beside(point, *size_of(axes, name))
         inside = [box for box in found if box[:2].min() >= 0.0 and box[2:].max() <= 1.0]
         inside = inside or [_pushed_inside(box) for box in found]

@@ -95,16 +95,12 @@ def flip_evaluator() -> Callable[..., Any] | None:
 def lpips(predicted: Tensor, truth: Tensor) -> float | None:
     """Learned perceptual distance (AlexNet, as in nerfstudio) of two [H, W, 3] images in 0..1; None
     where its network is not at hand or a side is under `LPIPS_MINIMUM_SIDE` pixels."""
-    if min(predicted.shape[:2]) < LPIPS_MINIMUM_SIDE:
+    is_small = min(predicted.shape[:2]) < LPIPS_MINIMUM_SIDE
+    if is_small or (metric := lpips_metric("alex")) is None:
         return None
-    metric = lpips_metric("alex")
-    if metric is None:
-        return None
+    images = (_batched(image).clamp(0, 1) for image in (predicted, truth))
     with torch.no_grad():
-        distance = metric.to(predicted.device).net(
-            _batched(predicted).clamp(0, 1), _batched(truth).clamp(0, 1), normalize=True
-        )
-    return float(distance)
+        return float(metric.to(predicted.device).net(*images, normalize=True))
 
 
 @functools.cache

@@ -34,15 +34,11 @@ LIGHTING = {"ambient": 0.85, "diffuse": 0.4, "specular": 0.02, "fresnel": 0.0}
 
 
 def write_page(occupancy: Occupancy, path: Path, colours: SceneColours | None = None) -> Path:
-    """Writes the page: one file that needs no network, in the coordinates of the run.
+    """Writes the page: one file that needs no network, in the coordinates of the run. OSError if it
+    cannot be written there.
 
-    It shows the faces of kept cells, the cameras, the box of the occupancy, and space that no
-    photograph shows. A click on a name hides or shows a part.
-
-    Args:
-        colours: of the scene; None colours by height.
-    Raises:
-        OSError: it cannot be written there.
+    It shows the faces of kept cells, in the scene's colours or by height, the cameras, the box of
+    the occupancy, and space that no photograph shows. A click on a name hides or shows a part.
     """
     import plotly.graph_objects as plotly
 

@@ -15,7 +15,7 @@ from PIL import Image, ImageColor
 from leco_plugin.chart.theme import LIGHT
 from leco_plugin.cli import main
 from leco_plugin.evaluation import history_picture
-from leco_plugin.evaluation.history_picture import spread_evenly
+from leco_plugin.evaluation.metrics import spread_evenly
 from leco_plugin.learning.history import FILE_NAME, GateHistory
 
 
