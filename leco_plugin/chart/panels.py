@@ -106,16 +106,14 @@ def cost_panel(cost: Cost, lines: Sequence[Line]) -> Panel:
 
 def kept_panel(figure: str, held: Sequence[Representation], lines: Sequence[Line]) -> Panel:
     """Space kept at equal loss against one of `HELD_COSTS`, of occupancies that have it."""
-    names = [line.name for line in lines]
+    numbers = {line.name: i for i, line in enumerate(lines)}
     points = []
     for one in (one for one in held if one.has(figure) and one.name != SPARSE):
-        large = [other.name for other in held if other.name in names and one.is_small_of(other)]
-        like = one.name if one.name in names else large[0] if large else None
-        number = None if like is None else names.index(like)
-        small = like is not None and like != one.name
-        points.append(
-            Point(one.name, one.median(figure), one.kept, number, ours=one.ours, small=small)
-        )
+        itself, place = numbers.get(one.name), (one.median(figure), one.kept)
+        large = [numbers[o.name] for o in held if o.name in numbers and one.is_small_of(o)]
+        like = itself if itself is not None else next(iter(large), None)
+        small = itself is None and like is not None
+        points.append(Point(one.name, *place, like, ours=one.ours, small=small))
     return Panel(HELD_COSTS[figure], tuple(points))
 
 

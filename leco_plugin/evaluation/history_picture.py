@@ -136,8 +136,8 @@ class _Film:
         for look in looks:
             for axes in (*left, *right):
                 axes.clear()
-            self._draw_slices(*left, look)
-            self._draw_lines(*right, look)
+            self._draw_slices(left[0], left[1], look)
+            self._draw_lines(right[0], right[1], look)
             figure.suptitle(f"Learning what is empty: step {self.history.steps[look]}")
             yield figure
 
