@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
@@ -48,8 +48,7 @@ def chart(
             are compared.
         steps: Training steps of each run; with both, a run ends with the first.
         seeds: Seeds.
-        learn_seconds: Most of a run, about, that learning its occupancy may take. By default 0.4 of
-            seconds.
+        learn_seconds: Most of a run, about, for learning its occupancy. By default 0.4 of seconds.
         images: Whole test images that each run renders at its end.
         at_once: Runs beside each other, which share the threads of the CPU. By default 1; suites
             have 2 where there is no GPU.
@@ -62,8 +61,8 @@ def chart(
     check_report(json, data)
     from leco_plugin.chart.command import make_charts, refuse_failures
 
-    asked: dict[str, Any] = {"seconds": seconds, "steps": steps, "learn_seconds": learn_seconds}
-    asked |= {"images": images, "at_once": at_once, "held_out": held_out}
+    times = {"seconds": seconds, "steps": steps, "learn_seconds": learn_seconds}
+    asked = {**times, "images": images, "at_once": at_once, "held_out": held_out}
     made = make_charts(data, out, methods, samplers, suite, seeds, reuse, asked)
     for folder, results in made.items():
         drawn = "chart.png, chart.html, " if results["runs"] else ""
