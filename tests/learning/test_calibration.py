@@ -144,6 +144,9 @@ def test_a_price_that_nobody_knows_was_not_spent_and_one_that_is_no_number_stays
     known = found.on_top_of({"lost_surface_mass": 2e-4, "image_price_db": None})
     assert known.lost_surface_mass == pytest.approx(3e-4)
     assert known.image_price_db == 0.02
+    gained = {"image_price_db": -0.5, "lost_mass": 2e-3, "price_error_db": 2e-3}
+    assert found.on_top_of(gained)[2:4] == (pytest.approx(3e-3), 0.02), "no gain is spent"
+    assert found.on_top_of(gained).price_error_db == pytest.approx(math.hypot(1e-3, 2e-3))
     costs = Measured(0.5, math.nan, 0.1, math.nan, 0.5).on_top_of({"image_price_db": 0.01})
     assert math.isnan(costs.image_price_db) and math.isnan(costs.lost_surface_mass)
     assert costs.lost_mass == 0.1
@@ -328,6 +331,23 @@ def test_a_backdrop_is_worth_what_the_image_loses_without_it() -> None:
     assert expected > 0.0
     assert backdrop_price(problem.rendering()) == pytest.approx(expected, rel=1e-4)
     assert backdrop_price(DenseRendering([], [], problem.render_kept)) == 0.0
+
+
+def test_against_an_exact_rendering_prices_are_above_100_db() -> None:
+    problem, threshold = Problem(4), 0.3
+    problem.truths = [reference.rgb.clone() for reference in problem.references]
+    floor = 1e-10 * 2 * RAYS * 3
+    gone = [reference.occupancies < threshold for reference in problem.references]
+    for way in ("measured", "of a backdrop"):
+        images = [problem.render_kept(i, ~mask) for i, mask in enumerate(gone)]
+        error = sum(float((a - b).square().sum()) for a, b in zip(images, problem.truths))
+        expected = pytest.approx(10.0 * math.log10((error + floor) / floor), rel=1e-4)
+        if way == "measured":
+            assert measure(problem.rendering(), threshold).image_price_db == expected
+            for reference, mask in zip(problem.references, gone):
+                reference.always_kept.copy_(mask)
+        else:
+            assert backdrop_price(problem.rendering()) == expected
 
 
 def test_without_an_image_there_is_no_image_price_and_no_rays_cost_nothing() -> None:

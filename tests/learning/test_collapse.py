@@ -58,6 +58,15 @@ def healed(
 def test_a_collapse_must_last_unless_the_first_phase_is_over() -> None:
     progress = Progress()
     assert look(progress, 98, 0.0, SPREAD, last=True) is None  # too early to tell
+    assert look(Progress(), 99, 0.0, SPREAD, last=True) is not None
+    for step, known in ((398, False), (399, True)):  # of a gate that began anew
+        found = look(Progress(began=300), step, 0.0, SPREAD, last=True)
+        assert (found is not None) == known
+    for fewest, has_learned in ((0.89, True), (0.9, False)):
+        progress = Progress(fewest_kept=fewest)
+        look(progress, 199, 1.0, SPREAD, last=False)
+        assert progress.suspected_since == (199 if has_learned else -1)
+    progress = Progress()
     for step in (199, 298):
         assert look(progress, step, 0.0, SPREAD, last=False) is None
     assert look(progress, 299, 0.0, SPREAD, last=False) is not None
@@ -78,8 +87,11 @@ def test_a_healed_gate_learns_on_dense_samples_first_and_under_less_pressure(kin
 
     begins, half, ends = (annealed(LOSSES, progress, step) for step in (199, 224, 250))
     assert begins.contribution == begins.imbalance == begins.density == begins.agreement == 0.0
-    assert half.contribution == pytest.approx(25 / 51 * LOSSES.contribution)
-    assert ends.contribution == LOSSES.contribution and ends.density == LOSSES.density
+    for name in ("contribution", "agreement", "density"):
+        assert getattr(half, name) == pytest.approx(25 / 51 * getattr(LOSSES, name))
+        assert getattr(ends, name) == getattr(LOSSES, name)
+    assert half.imbalance == pytest.approx(25 / 51 * pull * LOSSES.imbalance)
+    assert half.balance == LOSSES.balance  # which nothing is wrong with
     assert ends.imbalance == pytest.approx(pull * LOSSES.imbalance)
     assert ends.emphasis == pytest.approx(LOSSES.emphasis / pull)
     assert ends.balance == LOSSES.balance
@@ -179,6 +191,14 @@ def test_a_gate_that_was_opened_late_or_begins_anew_is_healed(learned, healed_at
         (0.3, [0.7, 0.2, 0.1], True, None),
         (1.0, [0.0, 0.5, 0.5], False, None),  # it has not learned enough yet
         (0.3, [0.7, 0.3], True, None),  # there is only one scene expert
+        (1.9e-4, [1.0, 0.0, 0.0], False, "all space empty"),
+        (2.1e-4, [1.0, 0.0, 0.0], False, None),
+        (0.9996, [0.0, 0.5, 0.5], True, "all space occupied"),
+        (0.9994, [0.0, 0.5, 0.5], True, None),
+        (0.3, [0.5, 0.4996, 0.0004], True, "scene expert 1 takes all points"),
+        (0.3, [0.5, 0.4994, 0.0006], True, None),
+        (0.3, [0.989, 0.0, 0.011], True, "scene expert 2 takes all points"),
+        (0.3, [0.991, 0.0, 0.009], True, None),  # too few to say so
     ],
 )
 def test_a_collapse_is_named(kept: float, shares: list[float], has_learned: bool, cause) -> None:

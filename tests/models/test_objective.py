@@ -8,7 +8,13 @@ import pytest
 import torch
 
 from leco_plugin.models.gate import occupancy_from_logits
-from leco_plugin.models.losses import density_loss, imbalanced_gate_loss
+from leco_plugin.models.losses import (
+    balance_loss,
+    contribution_loss,
+    density_loss,
+    imbalanced_gate_loss,
+    widen,
+)
 from leco_plugin.models.objective import GateLossConfig, gate_losses
 from leco_plugin.models.rendering import Intervals, Rays, Shaded, backdrop_of
 from leco_plugin.samplers.packed import pack_info
@@ -34,7 +40,7 @@ def batch() -> tuple[Shaded, Intervals]:
 
 def losses_of(config: GateLossConfig, shaded: Shaded, intervals: Intervals):
     half_extent = torch.tensor(2.0)
-    return gate_losses(config, shaded, intervals, RAYS, half_extent, homogeneous=False, ramped=1.0)
+    return gate_losses(config, shaded, intervals, RAYS, half_extent, homogeneous=False, ramped=0.6)
 
 
 @pytest.mark.parametrize("form", ["logit", "paper"])
@@ -62,6 +68,21 @@ def test_the_papers_form_is_its_two_losses_of_all_samples_before_the_backdrop() 
     assert found.keys() == expected.keys()
     for name in expected:
         torch.testing.assert_close(found[name], expected[name])
+
+
+def test_the_logit_form_is_its_losses_with_their_own_numbers() -> None:
+    shaded, intervals = batch()
+    torch.manual_seed(1)
+    weights = 0.2 * torch.rand(10)
+    config = GateLossConfig(contribution=0.3, weight_at_full=0.1, emphasis=5.0, balance=2.0)
+    found = losses_of(config, shaded._replace(weights=weights), intervals)
+    wide = widen(weights[~ON_BACKDROP], torch.arange(1, 8) != 4)
+    contribution = contribution_loss(shaded.logits[~ON_BACKDROP], wide, 0.1, 5.0)
+    torch.testing.assert_close(found["contribution_loss"], 0.3 * contribution)
+    on_scene = shaded.routes > 0
+    among = shaded.logits[on_scene, 1:].softmax(dim=-1), shaded.routes[on_scene] - 1
+    assert bool(on_scene.any()) and not bool(on_scene.all())
+    torch.testing.assert_close(found["balance_loss"], 2.0 * balance_loss(*among))
 
 
 def test_without_a_target_ratio_all_experts_are_to_get_equally_many_points() -> None:
@@ -98,4 +119,5 @@ def test_what_the_field_gives_up_is_a_mean_over_rays_not_over_samples() -> None:
     found = losses_of(config, shaded._replace(weights=weights), intervals)["agreement_loss"]
     occupied = occupancy_from_logits(shaded.logits.detach())
     doubt = (1.0 - occupied / 0.9).clamp(min=0.0) * ~ON_BACKDROP
-    torch.testing.assert_close(found.detach(), 3.0 * (weights * doubt).sum() / len(RAYS.origins))
+    a_ray = (weights * doubt).sum() / len(RAYS.origins)
+    torch.testing.assert_close(found.detach(), 3.0 * 0.6 * a_ray)

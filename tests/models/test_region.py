@@ -18,9 +18,9 @@ from leco_plugin.space import NO_WALL
 SLAB = torch.tensor([-NO_WALL, -NO_WALL, -1.0, NO_WALL, NO_WALL, 1.0])
 
 
-def region_of(aabb: torch.Tensor, far: float = 5.0) -> Region:
+def region_of(aabb: torch.Tensor, far: float = 5.0, half: float = 1.0) -> Region:
     region = Region()
-    region.set(SceneBounds("box", torch.zeros(3), 1.0, 0.1, far, aabb, ""))
+    region.set(SceneBounds("box", torch.zeros(3), half, 0.1, far, aabb, ""))
     return region
 
 
@@ -58,15 +58,17 @@ def test_a_crop_that_ends_no_ray_leaves_each_its_backdrop_or_none() -> None:
 
 
 def test_ground_beyond_far_is_reached_where_a_photograph_shows_it() -> None:
-    region = region_of(SLAB, far=2.5)
+    """As far as a thousand half extents away."""
+    region = region_of(SLAB, far=2.5, half=2.0)
     region.seen.cells[:32] = False  # where x is negative
-    origins = torch.tensor([[0.5, 0.0, 9.0], [-0.5, 0.0, 9.0], [0.5, 0.0, 9.0]])
-    directions = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+    down, level = [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]
+    origins = torch.tensor([[0.5, 0.0, 1900.0], [-0.5, 0.0, 9.0], [0.5, 0.0, 9.0], [0.5, 0, 2100]])
+    directions = torch.tensor([down, down, level, down])
     cut = region.rays(origins, directions, None, torch.tensor(0.5))
     whole = region.down_to_the_floor(cut)
-    torch.testing.assert_close(whole.t_mins, torch.tensor([8.0, 8.0, 2.0]))
-    torch.testing.assert_close(whole.t_maxs, torch.tensor([10.0, 10.0, 2.5]))
-    assert whole.cut_off is not None and whole.cut_off.tolist() == [False, True, False]
+    torch.testing.assert_close(whole.t_mins, torch.tensor([1899.0, 8.0, 2.0, 2.0]))
+    torch.testing.assert_close(whole.t_maxs, torch.tensor([1901.0, 10.0, 2.5, 2.5]))
+    assert whole.cut_off is not None and whole.cut_off.tolist() == [False, True, False, False]
 
 
 @pytest.mark.parametrize("kind", ["box", "contraction"])
