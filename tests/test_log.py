@@ -130,3 +130,14 @@ def test_one_thing_is_counted_without_an_s() -> None:
     assert [log.counted(count, "run") for count in (0, 1, 2)] == ["0 runs", "1 run", "2 runs"]
     assert log.counted(1, "mask has", "masks have") == "1 mask has"
     assert log.counted(3, "mask has", "masks have") == "3 masks have"
+
+
+def test_a_duration_is_in_seconds_then_minutes_then_hours() -> None:
+    said = {
+        89.4: "89 s",
+        90.0: "2 min",
+        3569.0: "59 min",
+        3590.0: "1 h 0 min",
+        12000.0: "3 h 20 min",
+    }
+    assert {seconds: log.spell(seconds) for seconds in said} == said

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from ball_occupancy import CENTRE, HALF, RADIUS, WALLS, ball
 from scene_files import change, described, refused
@@ -142,8 +143,15 @@ def test_a_start_for_splats_is_a_copy_of_the_scene_with_kept_points(
     assert made["frames"][0]["file_path"] == made["train_filenames"][0] == photograph
 
 
-def test_a_volume_is_what_the_occupancy_says_in_its_box(file: Path, tmp_path: Path) -> None:
-    facts = export(file, "npz", tmp_path / "v.npz", 24)
+def test_a_volume_is_what_the_occupancy_says_in_its_box(tmp_path: Path) -> None:
+    """Walls cut it to three sides of different lengths, and leave the ball aside of its middle."""
+    known, far = ball(), 1e6
+    walls = torch.tensor([-0.25, -far, -0.75, far, far, 2.0])
+    report = {"data_frame": FRAME}
+    made = Occupancy(known.gate, known.space, known.threshold, report=report, walls=walls)
+    made.save(tmp_path / "o.st")
+    facts = export(tmp_path / "o.st", "npz", tmp_path / "v.npz", 32)
+    assert facts["shape"] == [26, 32, 22]  # of 3.25, 4 and 2.75
     with np.load(tmp_path / "v.npz") as volume:
         assert list(volume["o"].shape) == facts["shape"] and volume["seen"].all()
         assert np.array_equal(volume["kept"], volume["o"] >= volume["threshold"])

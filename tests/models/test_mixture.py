@@ -9,16 +9,23 @@ import torch
 from small_learner import SMALLEST, small_mixture
 
 from leco_plugin.scenes.bounds import SceneBounds
+from leco_plugin.space import SpaceKind
 
 BOX = torch.tensor([-1.0] * 3 + [1.0] * 3)
-BOUNDS = SceneBounds("box", torch.zeros(3), 1.0, 0.5, 2.5, BOX, "")
 
 
-def test_learning_marches_as_coarsely_as_it_has_fewer_candidates() -> None:
+@pytest.mark.parametrize("kind", ["box", "contraction"])
+def test_learning_marches_as_coarsely_as_it_has_fewer_candidates(kind: SpaceKind) -> None:
     mixture = small_mixture(replace(SMALLEST, candidates=64, learn_candidates=16))
-    mixture.set_bounds(BOUNDS, median_length=2.0)
-    fine, coarse = mixture.rule(), mixture.rule(coarse=True)
-    assert coarse.step_size > 3.0 * fine.step_size > 0.0
+    mixture.set_bounds(SceneBounds(kind, torch.zeros(3), 1.0, 0.5, 2.5, BOX, ""), 3.0)
+    steps = []
+    for coarse, candidates in ((False, 64), (True, 16)):
+        cone = 0.0 if kind == "box" else 5.0 ** (1.0 / candidates) - 1.0
+        steps.append(3.0 / candidates if kind == "box" else 0.5 * cone)
+        assert mixture.rule(coarse) == pytest.approx((steps[-1], cone), rel=1e-5)
+    up, none = torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, dtype=torch.int64)
+    past = mixture.rays(9.0 * up, up, none)  # what is left of a ray that misses: a fine step
+    assert float(past.t_maxs - past.t_mins) == pytest.approx(steps[0], rel=1e-4)
 
 
 def test_a_gate_of_more_experts_than_its_field_is_refused() -> None:

@@ -97,9 +97,9 @@ def test_gradients_reach_the_gate_through_its_value_and_every_chosen_expert() ->
 
 def test_noise_moves_densities_and_nothing_else() -> None:
     model, mapped = field(), points(500)
-    noisy, clean = model(mapped, noise=1.0), model(mapped)
+    noisy, clean = model(mapped, noise=0.5), model(mapped)
     noise = torch.log(torch.expm1(noisy.sigmas)) - torch.log(torch.expm1(clean.sigmas))
-    assert abs(float(noise.detach().std()) - 1.0) < 0.15
+    assert abs(float(noise.detach().std()) - 0.5) < 0.08
     assert torch.equal(noisy.features, clean.features)
     assert torch.equal(model(mapped).sigmas, clean.sigmas)
 
