@@ -129,7 +129,7 @@ class Region(nn.Module):
     def leaves_by_floor(self, cut: Rays) -> Tensor:
         """Whether rays leave a bounded scene through its floor, inside its cube: bool [R]."""
         ends = torch.addcmul(cut.origins, cut.directions, cut.t_maxs[:, None])
-        at_floor = (ends[:, 2] - self.aabb[2]).abs() <= 1e-3 * (self.aabb[5] - self.aabb[2])
+        at_floor = ends[:, 2] - self.aabb[2] <= 1e-3 * (self.aabb[5] - self.aabb[2])
         inside = self.space.map(ends).abs().amax(dim=-1) <= 1.0
         return at_floor & inside & (cut.t_maxs > cut.t_mins)
 

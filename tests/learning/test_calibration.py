@@ -300,6 +300,14 @@ def test_the_error_of_a_price_is_that_of_two_shares_however_much_is_lost() -> No
     assert error == pytest.approx(10.0 / math.log(10.0) * math.hypot(0.25, 0.25))
 
 
+@pytest.mark.parametrize(("errors", "fits"), [(0.99, True), (1.01, False)])
+def test_a_price_may_lie_one_standard_error_beyond_its_bound(errors: float, fits: bool) -> None:
+    mass, price = CONFIG.lost_surface_mass, CONFIG.image_price_db
+    surface = Measured(0.5, mass + errors * 1e-4, 0.0, 0.0, 0.5, 1e-4, 9.0)
+    image = Measured(0.5, 0.0, 0.0, price + errors * 0.02, 0.5, 9.0, 0.02)
+    assert surface.within(CONFIG) == image.within(CONFIG) == fits
+
+
 def test_one_ray_of_a_few_does_not_decide_and_many_do() -> None:
     for scene, fits in ((Problem(0), True), (Problem(1), False)):
         for reference in scene.references:

@@ -142,6 +142,16 @@ def test_a_gate_in_the_papers_form_that_less_force_does_not_heal_is_taught_in_lo
     assert "gate and field start anew" in said  # what is left for one that collapses in logit form
 
 
+def test_a_recovery_adds_to_those_before_and_is_as_long_as_the_phase_was() -> None:
+    """200 steps are configured, of which a short run has 120."""
+    progress = Progress(learn_steps=120, configured=200, phase=120, pull=2.0, balance=2.0)
+    healed("empty", progress, 99)
+    assert (progress.learn_steps, progress.dense_until) == (160, 130)
+    healed("one expert", progress, 149, shares=ONE)
+    assert progress.learn_steps == 180
+    assert (progress.pull, progress.balance) == (2.0 / EASED, 2.0 * EASED)
+
+
 def test_a_new_or_healed_gate_has_until_the_end_to_call_something_empty() -> None:
     progress = Progress()
     for step in range(49, 999, 50):
@@ -216,6 +226,7 @@ def test_a_reset_gate_is_undecided_again() -> None:
     probabilities = head(features).detach().softmax(dim=-1)
     assert not bool(head.bias.any())
     assert float(probabilities.mean(dim=0).min()) > 0.05
+    assert float(head(features).detach().std()) == pytest.approx(0.05 * 64**0.5, rel=0.2)
     assert head.weight.requires_grad
 
 

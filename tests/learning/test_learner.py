@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -85,6 +86,25 @@ def test_a_resumed_run_of_another_schedule_learns_for_half_of_the_steps_that_are
     progress, longer = Progress(learn_steps=50, configured=50), ScheduleConfig(learn_steps=500)
     small_learner(ARun(start=100, end=300), progress=progress, schedule=longer).begin()
     assert progress.learn_steps == 100 + 100
+
+
+def test_before_there_is_a_threshold_a_tenth_is_kept(learner: Learner) -> None:
+    o = torch.tensor([0.09, 0.11, 0.5, 0.9])
+    logits = torch.stack([torch.zeros(4), o.logit(), torch.full((4,), -30.0)], dim=1)
+    learner.probes = SimpleNamespace(logits=lambda: logits)  # type: ignore[assignment]
+    learner.after_step(24, 0.0, 1.0)
+    assert learner.progress.decisions.tolist() == [False, True, True, True]
+
+
+def test_what_began_anew_ramps_from_there() -> None:
+    """From 30 to 70 of its 100 steps."""
+    progress = Progress(learn_steps=1100, configured=100, began=1000)
+    learner = small_learner(progress=progress, schedule=ScheduleConfig(learn_steps=100))
+    plans = [learner.before_step(1000 + step) for step in (20, 40, 50, 80)]
+    assert [plan.ramped for plan in plans] == pytest.approx([0.0, 0.25, 0.5, 1.0])
+    assert [plan.following is None for plan in plans] == [True, False, False, False]
+    learner.mixture.freeze(0.0, {"empty_fraction": 0.0})
+    assert [learner.before_step(step).coarse for step in (1050, 1080)] == [True, False]
 
 
 def test_a_resumed_run_has_the_earlier_history_in_its_own_folder(

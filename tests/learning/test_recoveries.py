@@ -97,7 +97,7 @@ def test_a_collapse_is_found_within_200_steps_of_its_start(
         run.learner.after_step(step, 0.0, 1.0)
         if run.progress.recoveries:
             break
-    assert starts + 95 <= step < starts + 200
+    assert starts + 95 <= step < starts + 150
     said = printed()
     assert f"step {step}: " in said and cause in said and "(recovery" in said
 

@@ -15,6 +15,7 @@ from leco_plugin.learning.schedule import (
     is_unsettled,
     ramp,
     schedule_since,
+    steps_of_an_extension,
 )
 
 SCHEDULE = ScheduleConfig(learn_steps=1000, earliest=0.5, ramp_from=0.2, ramp_to=0.6)
@@ -29,6 +30,7 @@ def test_the_ramp_rises_from_zero_to_one_between_its_ends() -> None:
 def test_a_ramp_that_would_end_before_it_begins_is_refused() -> None:
     with pytest.raises(ValueError, match=r"ramp-from is 0\.8.*at most ramp-to, 0\.7"):
         ScheduleConfig(ramp_from=0.8)
+    ScheduleConfig(ramp_from=0.7)  # at once
 
 
 def test_a_gate_that_begins_anew_has_the_schedule_of_the_steps_from_there() -> None:
@@ -47,6 +49,7 @@ def test_a_gate_is_frozen_when_its_decisions_have_settled_or_at_the_step_limit()
     assert not converged(498, 1.0, SCHEDULE)
     assert converged(499, 1.0, SCHEDULE)
     assert not converged(499, SCHEDULE.agreement - 1e-3, SCHEDULE)
+    assert converged(499, SCHEDULE.agreement, SCHEDULE)
     assert converged(999, 0.0, SCHEDULE)
 
 
@@ -58,6 +61,10 @@ def test_a_gate_that_changes_its_mind_at_the_step_limit_learns_on_twice() -> Non
     assert not is_unsettled(999, SCHEDULE.settled, SCHEDULE, 0)
     assert not is_unsettled(4 * SCHEDULE.steps_per_check - 2, below, SCHEDULE, 0)  # a short run
     assert is_unsettled(4 * SCHEDULE.steps_per_check - 1, below, SCHEDULE, 0)
+
+
+def test_an_extension_is_a_quarter_and_a_step_at_least() -> None:
+    assert [steps_of_an_extension(steps) for steps in (3, 11, 200)] == [1, 2, 50]
 
 
 def test_agreement_is_the_share_of_equal_decisions() -> None:

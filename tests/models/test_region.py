@@ -71,6 +71,27 @@ def test_ground_beyond_far_is_reached_where_a_photograph_shows_it() -> None:
     assert whole.cut_off is not None and whole.cut_off.tolist() == [False, True, False, False]
 
 
+@pytest.mark.parametrize(
+    ("far", "by_floor", "meets_ground"),
+    [
+        (2.9, [False] * 5, [False] * 5),
+        (2.99, [False] * 5, [True, False, True, False, False]),
+        (3.5, [True, False, False, False, False], [True, False, True, False, False]),
+    ],
+)
+def test_a_ray_leaves_by_the_floor_that_ends_on_it_within_the_cube(
+    far: float, by_floor: list[bool], meets_ground: list[bool]
+) -> None:
+    """Down, up, down beside the cube, level, and down from the floor itself."""
+    region = region_of(SLAB, far)
+    region.lowest.fill_(-0.95)
+    origins = [[0.5, 0, 2], [0.5, 0, -2], [1.5, 0, 2], [-4.0, 0, -0.5], [0.5, 0, -1]]
+    directions = [[0.0, 0, -1], [0, 0, 1], [0, 0, -1], [1, 0, 0], [0, 0, -1]]
+    cut = region.cut(torch.tensor(origins), torch.tensor(directions))
+    assert region.leaves_by_floor(cut).tolist() == by_floor
+    assert region.meet_ground(cut).tolist() == meets_ground
+
+
 @pytest.mark.parametrize("kind", ["box", "contraction"])
 def test_a_median_ray_has_the_wanted_number_of_candidates(kind) -> None:
     length = 3.0 if kind == "box" else 4.9
