@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from leco_plugin.models.losses import (
-    HUE_WEIGHT,
     adjoining,
     agreement_loss,
     backdrop_loss,
@@ -32,7 +31,7 @@ def test_errors_in_hue_weigh_more_and_the_mean_is_still_the_best_colour() -> Non
     seen = torch.rand(50, 3, dtype=torch.float64)
     brightness, hue = torch.tensor([[0.1, 0.1, 0.1], [0.1, -0.1, 0.0]], dtype=torch.float64)
     assert float(color_loss(seen + brightness, seen)) == pytest.approx(0.01)
-    assert float(color_loss(seen + hue, seen)) == pytest.approx(HUE_WEIGHT * 0.02 / 3.0)
+    assert float(color_loss(seen + hue, seen)) == pytest.approx(8.0 * 0.02 / 3.0)
     color = seen.mean(dim=0).requires_grad_()
     color_loss(color.expand_as(seen), seen).backward()
     torch.testing.assert_close(color.grad, torch.zeros_like(color))

@@ -85,6 +85,16 @@ def test_the_logit_form_is_its_losses_with_their_own_numbers() -> None:
     torch.testing.assert_close(found["balance_loss"], 2.0 * balance_loss(*among))
 
 
+@pytest.mark.parametrize(("experts", "balanced"), [(1, False), (2, True)])
+def test_one_scene_expert_is_balanced_with_none(experts: int, balanced: bool) -> None:
+    shaded, intervals = batch()
+    few = shaded._replace(
+        logits=shaded.logits[:, : 1 + experts], routes=shaded.routes.clamp(max=experts)
+    )
+    found = losses_of(GateLossConfig(), few, intervals)["balance_loss"]
+    assert (float(found.detach()) > 0.0) == balanced
+
+
 def test_without_a_target_ratio_all_experts_are_to_get_equally_many_points() -> None:
     shaded, intervals = batch()
     open_ratio, equal = (

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from leco_plugin.models.region import Region, marching_rule, within_crop
+from leco_plugin.models.region import Region, SeenBackdrops, marching_rule, within_crop
 from leco_plugin.models.rendering import Rays
 from leco_plugin.samplers import marching
 from leco_plugin.samplers.marching import March, march
@@ -36,6 +36,7 @@ def rays_of(region: Region, images: torch.Tensor | None = None, cut: bool = Fals
 def test_rays_are_cut_to_the_box_and_to_near_and_far() -> None:
     region = region_of(SLAB)
     assert bool(region.known) and not bool(Region().known)
+    assert float(region.lowest) == -torch.inf  # nothing is known of the ground
     rays = rays_of(region, torch.arange(3), cut=True)
     torch.testing.assert_close(rays.t_mins[0], torch.tensor(1.0))
     torch.testing.assert_close(rays.t_maxs[0], torch.tensor(3.0))
@@ -103,27 +104,47 @@ def test_a_median_ray_has_the_wanted_number_of_candidates(kind) -> None:
     assert (rule.cone_angle > 0.0) == (kind == "contraction")
 
 
-def test_a_ray_along_a_wall_that_misses_the_box_stays_finite() -> None:
+@pytest.mark.parametrize("height", [-2.0, 2.0])
+def test_a_ray_along_a_wall_that_misses_the_box_stays_finite(height: float) -> None:
     region = region_of(torch.tensor([-1.0, -1.0, -0.5, 1.0, 1.0, 0.5]), far=3.0)
-    rays = region.cut(torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 0.0]]))
-    assert bool(rays.t_mins.isfinite())
-    assert bool(rays.t_maxs.isfinite())
-    assert bool(rays.t_maxs <= rays.t_mins)
+    rays = region.cut(torch.tensor([[0.0, 0.0, height]]), torch.tensor([[1.0, 0.0, 0.0]]))
+    assert 0.1 <= float(rays.t_mins) <= 3.0
+    assert 0.0 <= float(rays.t_maxs) <= float(rays.t_mins)
+
+
+def test_a_backdrop_is_known_within_a_degree_of_where_it_was_seen() -> None:
+    def at(heights: list[float], length: float, aside: float = 0.0) -> Rays:
+        z = torch.tensor(heights)
+        y = torch.full_like(z, aside)
+        directions = torch.stack([(1.0 - z * z - y * y).sqrt(), y, z], dim=1)
+        ends = torch.ones_like(z), torch.full_like(z, 1.0 + length)
+        return Rays(torch.zeros_like(directions), directions, *ends, None)
+
+    heights = [0.27, 0.29, 0.31, 0.33]
+    for noted, other in ((1.0, -1.0), (-1.0, 1.0)):  # of rays that meet the scene, and that miss it
+        backdrops = SeenBackdrops()
+        backdrops.note(at([0.3, 0.1], noted), torch.tensor([True, False]))
+        assert backdrops(at(heights, noted)).tolist() == [False, True, True, False]
+        assert not bool(backdrops(at([*heights, 0.1], other)).any())
+        assert not bool(backdrops(at([0.1], noted)).any())
+        beside = [bool(backdrops(at([0.3], noted, aside))) for aside in (-0.2, -0.1, 0.2, 0.3)]
+        assert beside == [False, True, True, False]  # in cells that touch, an eighth wide
 
 
 @pytest.mark.parametrize(
     ("asked", "option"),
     [
-        ((BoundsConfig(), 0.2, None), "near"),
-        ((BoundsConfig(), None, 3.0), "far"),
-        ((BoundsConfig(altitudes=(-1.0, 0.5)), None, None), "bounds.altitudes"),
+        ((BoundsConfig(), 0.1005, None), "near"),
+        ((BoundsConfig(), None, 3.99), "far"),
+        ((BoundsConfig(altitudes=(-0.7, 0.5)), None, None), "bounds.altitudes"),
+        ((BoundsConfig(altitudes=(-2.0, 2.0)), None, None), "bounds.altitudes"),
         ((BoundsConfig(space="contraction"), None, None), "bounds.space"),
         ((BoundsConfig(), None, None), None),
-        ((BoundsConfig("box", (-1.0, 1.0)), 0.1, 4.0), None),
+        ((BoundsConfig("box", (-0.7, 0.6)), 0.1, 4.0), None),
     ],
 )
 def test_a_run_that_is_gone_on_with_lies_where_it_was_begun(asked: Any, option: Any) -> None:
-    region = region_of(torch.tensor([-1.0] * 3 + [1.0] * 3), far=4.0)
+    region = region_of(torch.tensor([-1.0, -2.0, -0.7, 1.0, 2.0, 0.6]), far=4.0)
     if option is None:
         region.refuse_others(*asked)
         return

@@ -24,6 +24,7 @@ from leco_plugin.models.rendering import (
     mapped_middles,
     shade,
     sum_up,
+    weigh,
     with_backdrop,
 )
 from leco_plugin.samplers import marching
@@ -213,7 +214,7 @@ def test_what_is_too_faint_to_be_coloured_changes_a_pixel_by_a_fortieth_of_a_ste
     given = Intervals(torch.arange(50), torch.ones(50), torch.full((50,), 2.0))
     rgb = composite(white, torch.zeros(50, 2), weights, some_rays(50), given)  # type: ignore[arg-type]
     assert float((rgb - weights[:, None]).abs().max()) < 1.05 / 40.0 / 255.0
-    assert bool((rgb == 0.0).any())
+    assert torch.equal(rgb[:, 0] > 0.0, weights > 1e-4)
 
 
 def test_a_ray_meets_something_from_half_opacity_on() -> None:
@@ -225,10 +226,11 @@ def test_a_ray_meets_something_from_half_opacity_on() -> None:
 
 
 def test_a_ray_that_misses_the_scene_stays_transparent() -> None:
-    rays = some_rays(2)
-    rays = rays._replace(t_maxs=torch.tensor([0.05, 3.0]))
+    """As does one that ends where it begins, at 0.1."""
+    rays = some_rays(3)
+    rays = rays._replace(t_maxs=torch.tensor([0.05, 0.1, 3.0]))
     ended = with_backdrop(intervals_of(rays), rays, 0.05, 0.0)
-    assert ended.ray_indices[backdrop_of(ended, rays)].tolist() == [1]
+    assert ended.ray_indices[backdrop_of(ended, rays)].tolist() == [2]
 
 
 def test_the_backdrop_absorbs_without_changing_what_the_field_says() -> None:
@@ -250,9 +252,12 @@ def test_intervals_are_asked_in_their_middles() -> None:
         None,
     )
     intervals = Intervals(
-        torch.tensor([0, 1, 1]), torch.tensor([0.0, 1.0, 2.0]), torch.tensor([1.0, 2.0, 4.0])
+        torch.tensor([0, 1, 1, 1]),
+        torch.tensor([0.0, 1.0, 2.0, 9.0]),
+        torch.tensor([1.0, 2.0, 4.0, 13.0]),
     )
-    middles = torch.tensor([[0.0, 0.0, 0.5], [1.0, 1.5, 0.0], [1.0, 3.0, 0.0]])
+    # the last one lies beyond the cube, on whose face it is asked
+    middles = torch.tensor([[0.0, 0.0, 0.5], [1.0, 1.5, 0.0], [1.0, 3.0, 0.0], [1.0, 8.0, 0.0]])
     torch.testing.assert_close(mapped_middles(space, rays, intervals), middles / 8.0)
 
 
@@ -265,3 +270,21 @@ def test_the_backdrop_of_a_ray_shorter_than_a_step_begins_where_the_ray_does() -
     )
     starts = backdrop_starts(rays, step_size=0.5, cone_angle=0.0)
     torch.testing.assert_close(starts, torch.tensor([1.0, 2.5, 3.0]))
+    growing = backdrop_starts(rays, step_size=0.2, cone_angle=0.1)
+    torch.testing.assert_close(growing, torch.tensor([1.0, 2.7, 3.0]))
+    of_all = backdrop_starts(rays._replace(cut_off=None), step_size=0.2, cone_angle=0.1)
+    torch.testing.assert_close(of_all, torch.tensor([0.82, 2.7, 2.7]))
+
+
+def test_weights_are_of_densities_per_half_extent() -> None:
+    """Of lengths of 1, 2 and 1/2 half extents, on two of three rays; and of what is opaque."""
+    edges = torch.tensor([[1.0, 1.5, 2.0], [1.5, 2.5, 2.25]])
+    given, sigmas = Intervals(torch.tensor([0, 0, 2]), *edges), torch.tensor([0.8, 2.0, 3.0])
+    for opaque in (False, True):
+        is_backdrop = torch.tensor([False, opaque, False])
+        weights, packed_info = weigh(sigmas, is_backdrop, given, torch.tensor(0.5), 3)
+        light = torch.tensor(-0.8).exp()
+        second = light if opaque else light * -torch.tensor(-4.0).expm1()
+        expected = torch.stack([1.0 - light, second, -torch.tensor(-1.5).expm1()])
+        torch.testing.assert_close(weights, expected)
+        assert packed_info.tolist() == [[0, 2], [2, 0], [2, 1]]
