@@ -55,14 +55,20 @@ def test_what_rays_cross_is_seen_and_what_lies_behind_the_camera_is_not(kind: Sp
     assert 0.02 < float(seen.cells.float().mean()) < 0.5
 
 
-@pytest.mark.parametrize("away", [2.0, 12.0, 40.0])
-def test_a_camera_far_from_the_scene_leaves_no_gaps_in_it(away: float) -> None:
-    """A turntable seen through a long lens: sparse points, and the space with them, are small."""
-    seen, space, count = SeenSpace(), Space("contraction"), 3000
+@pytest.mark.parametrize(
+    ("kind", "away"),
+    [("contraction", 2.0), ("contraction", 12.0), ("contraction", 40.0), ("box", 2.0)],
+)
+def test_a_camera_far_from_the_scene_leaves_no_gaps_in_it(kind: SpaceKind, away: float) -> None:
+    """A turntable seen through a long lens: sparse points, and the space with them, are small. The
+    camera is as far away in half extents, and near the origin."""
+    seen, half, count = SeenSpace(), 0.25, 3000
+    space = Space(kind, (half * away, -0.3, 0.2), half)
     ends = 0.9 * (2.0 * torch.rand(count, 3, generator=torch.Generator().manual_seed(4)) - 1.0)
-    origins = torch.tensor([-away, 0.0, 0.0]).expand(count, 3)
+    ends = space.center + half * ends
+    origins = (space.center - torch.tensor([half * away, 0.0, 0.0])).expand(count, 3)
     directions = torch.nn.functional.normalize(ends - origins, dim=-1)
-    limits = torch.full((count,), 0.1), torch.full((count,), 100.0)
+    limits = torch.full((count,), 0.1 * half), torch.full((count,), half * (away + 4.0))
     seen.note(space, marching.Rays(origins, directions, *limits))
     assert bool(seen(space.map(ends)).all())
 

@@ -395,6 +395,16 @@ def test_near_the_median_depth_is_within_two_steps_of_it(seed: int) -> None:
             assert bool(near[sample]) == (abs(sample - median) <= SURFACE_STEPS)
 
 
+def test_steps_from_the_median_are_as_long_as_its_own() -> None:
+    """It lies in the fourth, at 3.5; the fifth has its middle 2.3 behind."""
+    ends = torch.tensor([1.0, 1.0, 1.0, 1.0, 3.6, 4.0]).cumsum(0)
+    starts = torch.cat([torch.zeros(1), ends[:-1]])
+    on_one_ray = torch.zeros(6, dtype=torch.int64)
+    shaded = shaded_of(torch.tensor([0.1, 0.1, 0.1, 0.5, 0.1, 0.1]), on_one_ray, torch.ones(1))
+    near = near_median_depth(shaded, Intervals(on_one_ray, starts, ends))
+    assert near.tolist() == [False, True, True, True, False, False]
+
+
 def test_before_a_backdrop_that_holds_the_median_there_is_no_surface() -> None:
     ray_indices, starts = torch.arange(3).repeat_interleave(4), torch.arange(4).repeat(3) * 0.5
     intervals = Intervals(ray_indices, starts, starts + 0.5)

@@ -96,6 +96,24 @@ def test_before_there_is_a_threshold_a_tenth_is_kept(learner: Learner) -> None:
     assert learner.progress.decisions.tolist() == [False, True, True, True]
 
 
+@pytest.mark.parametrize(("kept", "settled"), [(95, True), (96, False)])
+def test_a_gate_that_keeps_nearly_all_has_not_settled(
+    kept: int, settled: bool, learner: Learner
+) -> None:
+    learner.progress.decisions = decisions = torch.arange(100) < kept
+    assert learner._has_settled(174, decisions, last=False) == settled
+
+
+def test_of_half_a_sample_a_ray_a_batch_may_keep_none(learner: Learner) -> None:
+    kept_any: list[float] = []
+    learner.watch.after_step = lambda *given: kept_any.append(given[2])  # type: ignore
+    for expected, kept in ((0.51, 0.0), (0.49, 0.0), (0.51, 0.1)):
+        candidates = learner.mixture.sizes.candidates
+        learner.mixture.freeze(0.5, {"empty_fraction": 1.0 - expected / candidates, "step": 0})
+        learner.after_step(300, 1.0, kept)
+    assert kept_any == [0.0, 1.0, 1.0]
+
+
 def test_what_began_anew_ramps_from_there() -> None:
     """From 30 to 70 of its 100 steps."""
     progress = Progress(learn_steps=1100, configured=100, began=1000)
