@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -60,7 +61,17 @@ def test_a_guided_batch_has_as_many_samples(
     assert made.sampler.num_rays_per_batch == 100 * factor
 
 
-@pytest.mark.parametrize(("kept", "rays"), [(1.0, 100), (0.5, 200), (0.4, 250), (0.1, 400)])
+def test_a_guided_batch_has_half_of_the_rays_at_least(made: Any) -> None:
+    mixture = made.learner.mixture
+    mixture.sizes = replace(mixture.sizes, candidates=4 * mixture.sizes.learn_candidates)
+    mixture.freeze(0.0, {"empty_fraction": 0.0})
+    made.learner.before_step(0)
+    assert made.sampler.num_rays_per_batch == 50
+
+
+@pytest.mark.parametrize(
+    ("kept", "rays"), [(1.0, 100), (0.5, 200), (0.49, 200), (0.4, 250), (0.1, 400)]
+)
 def test_while_learning_rays_follow_what_is_shaded(made: Any, kept: float, rays: int) -> None:
     made.progress.learning_kept = kept
     made.learner.before_step(0)

@@ -139,6 +139,8 @@ def test_a_report_has_the_psnr_of_the_field_and_of_one_colour_on_the_rays_of_cal
         error = float((colours - truth).square().mean())
         assert report[name] == pytest.approx(-10.0 * math.log10(error), abs=1e-3)
     assert report["calibration_rays"] == 9
+    assert (report["near"], report["far"], report["aabb"]) == (0.5, 2.0, [-100.0] * 3 + [100.0] * 3)
+    assert (report["step_size"], report["cone_angle"]) == mixture.rule()
 
 
 def test_photographs_that_vouch_do_not_teach_the_small_gate_either() -> None:

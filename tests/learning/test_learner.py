@@ -82,6 +82,13 @@ def test_a_short_run_says_once_that_half_is_learning(printed: Any) -> None:
     assert printed() == ""
 
 
+@pytest.mark.parametrize(("end", "learns"), [(3, 2), (7, 3)])
+def test_a_run_of_a_few_steps_learns_for_two_at_least(end: int, learns: int) -> None:
+    progress = Progress()
+    small_learner(ARun(end=end), progress=progress).begin()
+    assert progress.learn_steps == learns
+
+
 def test_a_resumed_run_of_another_schedule_learns_for_half_of_the_steps_that_are_left() -> None:
     progress, longer = Progress(learn_steps=50, configured=50), ScheduleConfig(learn_steps=500)
     small_learner(ARun(start=100, end=300), progress=progress, schedule=longer).begin()
@@ -92,8 +99,10 @@ def test_before_there_is_a_threshold_a_tenth_is_kept(learner: Learner) -> None:
     o = torch.tensor([0.09, 0.11, 0.5, 0.9])
     logits = torch.stack([torch.zeros(4), o.logit(), torch.full((4,), -30.0)], dim=1)
     learner.probes = SimpleNamespace(logits=lambda: logits)  # type: ignore[assignment]
-    learner.after_step(24, 0.0, 1.0)
+    for step, seconds in ((23, 2.0), (24, 3.0)):
+        learner.after_step(step, seconds, 1.0)
     assert learner.progress.decisions.tolist() == [False, True, True, True]
+    assert learner.progress.learn_seconds == 5.0
 
 
 @pytest.mark.parametrize(("kept", "settled"), [(95, True), (96, False)])

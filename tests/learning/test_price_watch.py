@@ -92,6 +92,14 @@ def test_the_share_is_of_the_time_of_all_steps(monkeypatch: pytest.MonkeyPatch) 
     assert state.due == 9 + 20.0 / (SHARE_OF_TIME * 2.0)
 
 
+def test_a_measurement_that_is_due_while_nothing_is_skipped_is_put_off_once() -> None:
+    state = WatchState(due=700)
+    watch = PriceWatch(state, HeldOut.__new__(HeldOut), CONFIG, torch.device("cpu"))
+    for step, due in ((650, 700), (699, 700), (700, 700 + CONFIG.steps_per_recheck)):
+        assert watch.after_step(step, 1.0, 1.0, skips=False) is None
+        assert state.due == due
+
+
 def test_endless_new_rays_count_until_they_are_forgotten() -> None:
     rays, asked = torch.zeros(CONFIG.recheck_rays), []
 

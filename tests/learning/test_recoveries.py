@@ -12,6 +12,7 @@ import pytest
 import torch
 from small_learner import ARun, small_learner, small_mixture
 
+from leco_plugin.learning import learner as learner_module
 from leco_plugin.learning import recoveries
 from leco_plugin.learning.calibration import Measured
 from leco_plugin.learning.collapse import MOST_RECOVERIES, Collapse, GateCollapsed
@@ -97,7 +98,7 @@ def test_a_collapse_is_found_within_200_steps_of_its_start(
         run.learner.after_step(step, 0.0, 1.0)
         if run.progress.recoveries:
             break
-    assert starts + 95 <= step < starts + 150
+    assert starts + 95 <= step < starts + 150 and (step + 1) % 25 == 0
     said = printed()
     assert f"step {step}: " in said and cause in said and "(recovery" in said
 
@@ -153,6 +154,15 @@ def test_a_gate_in_the_papers_form_by_which_hardly_anything_is_skipped_is_taught
     assert run.frozen[-1] - run.frozen[0] <= 100
     said = "taught in logit form from now on" in printed()
     assert said == bool(recoveries)
+
+
+def test_advice_counts_the_steps_since_learning_began(healthy_run, monkeypatch) -> None:
+    said: list[int] = []
+    monkeypatch.setattr(learner_module, "advice_on", lambda _, steps, __: said.append(steps))
+    run = healthy_run(ScheduleConfig(learn_steps=200))
+    run.progress.began, run.progress.learn_steps = 50, 250
+    go_until_frozen(run, 1000)
+    assert said == [run.frozen[0] + 1 - 50]
 
 
 @pytest.mark.parametrize(("end", "again"), [(274, False), (275, True)])
