@@ -29,6 +29,8 @@ from leco_plugin.models.mixture import Mixture
         (0.04, 0.004, 1, "hardly anything is skipped; its gate collapsed once before; it learned"),
         (0.0, 0.0, 2, "no threshold keeps the price within its bounds, so nothing is skipped; its"),
         (0.3, 0.8, 1, None),
+        (0.3, 0.05, 0, None),
+        (0.3, 0.049, 0, "hardly anything is skipped"),
     ],
 )
 def test_what_skips_next_to_nothing_comes_with_advice(threshold, skipped, recoveries, said) -> None:
