@@ -145,7 +145,7 @@ def compare_at_freezing(model: Any, datamanager: Any, contender: Contender) -> d
     clock = Clock()
     clock.start()
     with evaluating(model):
-        lesson = lesson_of(Source(datamanager, model), model.config.gate_loss)
+        lesson = lesson_of(datamanager, model)
     of_lesson = clock.stop()
     scores: dict[str, Any] = {}
     rows: dict[str, list[dict[str, Any]]] = {"taught": [], "others": []}

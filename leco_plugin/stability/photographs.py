@@ -332,5 +332,5 @@ def _take_pictures(stage: Stage, capture: Capture, folder: Path) -> None:
     if len(places):
         write_points(folder / POINTS, places, colours)
         facts["ply_file_path"] = POINTS
-    held_out = [shot.file for shot in shots if shot.held_out]
+    held_out = [shot.file for shot, _, _ in taken if shot.held_out]
     write_json(folder / TRANSFORMS, transforms_of(facts, frames, held_out), indent=1)

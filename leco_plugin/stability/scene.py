@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from leco_plugin.scenes.city.cameras import QUINCUNX, Lens
+from leco_plugin.scenes.city.render import SUN
 from leco_plugin.scenes.city.shapes import Array, dot
 
 Triple = tuple[float, float, float]
