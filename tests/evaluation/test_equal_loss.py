@@ -251,10 +251,23 @@ def test_only_keeping_just_what_is_near_a_surface_is_perfect(truth: CityTruth) -
 
 
 def test_free_points_are_in_the_air_inside_the_walls(truth: CityTruth) -> None:
-    walls = torch.tensor([-0.3, -0.3, -1.0, 0.3, 0.3, 0.9])
-    points = free_points(truth, truth.visible_surface("test"), walls, STEP, HIGHEST)
+    walls = torch.tensor([-0.3, -0.2, -1.0, 0.15, 0.25, 0.9])
+    surface = truth.visible_surface("test")
+    points = free_points(truth, surface, walls, STEP, HIGHEST)
     assert len(points) > 1000 and not bool(truth.occupied(points).any())
-    assert float(points[:, 2].max()) <= 0.9 and float(points[:, :2].abs().max()) <= 0.3
+    ends = torch.stack([points.amin(dim=0), points.amax(dim=0)])
+    between = torch.stack([torch.cat([walls[:2], surface[:, 2].amin()[None]]), walls[3:]])
+    assert bool((ends[0] >= between[0]).all() and (ends[1] <= between[1]).all())
+    ends[0, 2] = between[0, 2]  # on the ground there is no air
+    torch.testing.assert_close(ends, between, rtol=0.0, atol=0.02)
+    higher = free_points(truth, surface, NO_WALLS, STEP, HIGHEST)
+    assert float(higher[:, 2].max()) == pytest.approx(HIGHEST, abs=0.01)
+    sides = torch.stack([surface[:, :2].amin(dim=0), surface[:, :2].amax(dim=0)])
+    ends = torch.stack([higher[:, :2].amin(dim=0), higher[:, :2].amax(dim=0)])
+    torch.testing.assert_close(ends, sides, rtol=0.0, atol=0.01)
+    roofs = float(surface[:, 2].max())
+    lower = free_points(truth, surface, NO_WALLS, STEP, roofs / 2)
+    assert float(lower[:, 2].max()) == pytest.approx(roofs, abs=0.01)
     assert float((truth.distance(points) * truth.scale).min()) > STEP
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from leco_plugin.evaluation import field_grids
+from leco_plugin.evaluation import clock, field_grids
 from leco_plugin.evaluation.field_grids import (
     FieldGrids,
     cells_to_ask,
@@ -21,7 +21,7 @@ from leco_plugin.evaluation.field_grids import (
 )
 from leco_plugin.evaluation.inspection import ViewBox
 
-BOX = ViewBox(torch.tensor([-1.0, -1.0, -0.5]), torch.tensor([1.0, 1.0, 0.5]))
+BOX = ViewBox(torch.tensor([-1.0, -0.6, -0.7]), torch.tensor([0.8, 1.0, 0.5]))
 CUBE, FINE = 16, 32
 
 
@@ -67,7 +67,7 @@ def test_a_known_surface_is_never_missed_by_a_coarse_cell() -> None:
     def film(mapped: Tensor) -> Tensor:
         return ((mapped[:, 2] - 0.061).abs() < 1e-6).float()
 
-    seen = torch.tensor([[0.3, 0.3, 0.061], [0.3, 0.3, 0.7]])  # the second lies outside
+    seen = torch.tensor([[0.3, 0.1, 0.061], [0.3, 0.1, 0.7]])  # the second lies outside
     known = seen, torch.tensor([1.0, 5.0])
     scores = fill_cells(film, BOX, cells_to_ask(8), known=known)
     assert float(look_up_scores(scores, BOX, seen[:1])) == 1.0
@@ -98,10 +98,11 @@ def test_a_cell_is_asked_where_the_coarser_grid_has_not_ruled_it_out(seed: int) 
     generator = torch.Generator().manual_seed(seed)
     cells = torch.rand(12, 12, 12, generator=generator)  # the same density anywhere in a cell
     coarse = torch.rand(6, 6, 6, generator=generator)
+    floor = float(coarse.flatten().sort().values[-5])  # a cell at it is not below it
     found = fill_cells(
-        partial(look_up_scores, cells, BOX), BOX, cells_to_ask(12, coarse, floor=0.98)
+        partial(look_up_scores, cells, BOX), BOX, cells_to_ask(12, coarse, floor=floor)
     )
-    expected = slow_refined(coarse, 0.98, cells)
+    expected = slow_refined(coarse, floor, cells)
     assert 0 < int((found > 0).sum()) < found.numel()
     assert torch.equal(found > 0, expected > 0)
     assert float((found == expected).float().mean()) > 0.99  # a place may be rounded next door
@@ -149,6 +150,23 @@ def test_a_grid_serves_the_next_one_only_if_that_is_twice_as_fine() -> None:
         return sum(asked) - before
 
     assert questions(16, 32) < questions(32) == questions(12, 32)
+
+
+def test_the_time_of_a_grid_is_that_of_the_coarser_ones_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A question takes a second; a grid of n cells a side asks 2048 / n times, 8 times at least."""
+    asked = [0.0]
+
+    def density(mapped: Tensor) -> Tensor:
+        asked[0] += 1.0
+        return torch.zeros(len(mapped))
+
+    monkeypatch.setattr(clock, "seconds_now", lambda: asked[0])
+    grids = FieldGrids(density, BOX, None, lambda scores: 0.0)
+    for cells, seconds in ((16, 128.0), (32, 128.0 + 64.0), (12, 170.0)):
+        assert grids.fill(cells) is not None and grids.clock.seconds == seconds
+    assert [field_grids.probes_in_a_cell(n) for n in (128, 256, 300, 512)] == [16, 8, 8, 8]
 
 
 def test_a_grid_that_asks_more_than_it_may_is_filled_only_from_a_coarser_one() -> None:
