@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 from chart_results import results, run, slow_front
 from hypothesis import given, settings
@@ -18,6 +19,7 @@ from leco_plugin.chart.summary import (
     KEPT,
     MEMORY,
     RENDERING,
+    best_so_far,
     circumstances,
     common_psnr,
     compare,
@@ -179,6 +181,29 @@ def test_a_last_step_beyond_the_time_that_was_given_is_nobodys_gain() -> None:
     lines = lines_of(results(*of_seeds("learned-occupancy", [21.0]), *of_seeds("own", [20.0])))
     (found,) = rivals(lines, seconds=9.0)
     assert found.passed == (9.0,) and found.sooner == (1.0,)
+
+
+def test_the_front_of_accuracy_is_the_best_mean_so_far() -> None:
+    slow = run("A", curve=[[2.0, 10.0], [10.0, 26.0]])
+    quick = run("B", curve=[[1.0, 12.0], [4.0, 18.0], [6.0, 17.0]])
+    times, reached = best_so_far(lines_of(results(slow, quick)))
+    assert (times[0], times[-1]) == (1.0, 10.0) and (times[1:] > times[:-1]).all()
+    for seconds, psnr in ((1.0, 12.0), (2.5, 15.0), (4.0, 18.0), (5.5, 18.0), (8.0, 22.0)):
+        assert np.interp(seconds, times, reached) == pytest.approx(psnr, abs=0.1)
+
+
+def test_the_time_that_a_grid_took_is_a_share_of_the_time_of_training() -> None:
+    figures = {"sampler": "occupancy-grid-64", "train_seconds": 8.0}
+    runs = [run("grid", seed, learn_seconds=s, **figures) for seed, s in enumerate((1.0, 7.0, 2.0))]
+    runs[0]["train_seconds"] = 20.0
+    (line,) = lines_of(results(*runs))
+    assert line.kept_up == 2.0 / 8.0
+
+
+def test_the_machine_and_how_many_runs_shared_it_are_said() -> None:
+    said = results(run("A"), protocol={"seconds": 10.0, "steps": None, "at_once": 3})
+    said["machine"] = {"cores": 4, "threads": 2, "device": "H200"}
+    assert circumstances(said) == "city, 10 s of training on H200, 3 runs at a time, one seed"
 
 
 def test_other_methods_are_no_rivals() -> None:

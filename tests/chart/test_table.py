@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from chart_results import occupancy, results, run
 
-from leco_plugin.chart.table import spread, table
+from leco_plugin.chart.table import number, spread, table
 
 FAILURE = {"name": "B", "method": "b", "sampler": "own", "seed": 1, "reason": "a | b"}
 
@@ -22,6 +22,48 @@ def test_every_contender_has_a_row_with_its_figures() -> None:
     assert asked[1] == "31"
     assert cells[1:3] == ["2", "20.50 (20.00 to 21.00)"]
     assert rows(text, "B")[0][2] == "19.00"
+
+
+def test_each_figure_stands_in_its_column_and_unit() -> None:
+    queries = {"field": 2_000_000, "learning": 3_000_000, "proposal": 4_000_000, "gate": 5_000_000}
+    figures = {"flip": 0.25, "lpips": 0.4, "image_psnr": 20.5, "ssim": 0.75, "steps": 123}
+    figures |= {"train_seconds": 45.0, "learn_seconds": 6.7, "step_seconds": 0.0789}
+    figures |= {"render_seconds_per_image": 1.25, "peak_memory_bytes": 3_500_000_000}
+    figures |= {"field_queries_per_ray": 67.0, "proposal_queries_per_ray": 8.0}
+    figures |= {"gate_queries_per_ray": 9.0, "train_queries": queries}
+    learned = occupancy(50_000, 0.125) | {"params": 21, "learn_seconds": 5.5}
+    learned |= {"kept_surface_recall": 0.97, "free_space_skipped": 0.61}
+    first = {"empty_fraction": 0.9, "image_price_db": 0.02, "lost_surface_mass": 2e-4}
+    text = table(results(run("A", occupancy=learned, at_freezing=first, **figures)))
+    names = ("method", "occupancy of", "positions asked of")
+    found = [
+        dict(zip(rows(text, name)[0][1:], cells[1:], strict=True))
+        for name, cells in zip(names, rows(text, "A"), strict=True)
+    ]
+    quality = {"PSNR, dB": "20.00", "mean PSNR of images": "20.50", "SSIM": "0.750"}
+    quality |= {"FLIP": "0.250", "LPIPS": "0.400", "s to 20.0 dB": "10", "seeds": "1"}
+    spent = {"steps": "123", "trained, s": "45", "of which learning, s": "6.7", "ms a step": "78.9"}
+    costs = {"rendering an image, s": "**1.25**", "peak memory, GB": "**3.5**"}
+    assert found[0] == quality | spent | costs | {"field queries a ray": "**67**"}
+    assert found[1] == {
+        **{"frozen": "1 of 1", "healed": "-", "parameters": "21", "kB": "50"},
+        **{"learned in, s": "5.5", "candidates skipped, %": "90", "price, dB": "0.02"},
+        **{"lost surface mass": "0.0002", "skipped at the end, %": "80"},
+        **{"price at the end, dB": "0.01", "lost at the end": "0.0001"},
+        **{"volume kept at 1e-3, %": "12.5", "true surface kept, %": "97"},
+        "free space skipped, %": "61",
+    }
+    assert found[2] == {
+        **{"field, a ray": "67", "proposals, a ray": "8", "frozen gate, a ray": "9"},
+        **{"field in training, M": "2", "field that learns first, M": "3"},
+        **{"proposals in training, M": "4", "frozen gate in training, M": "5"},
+    }
+
+
+def test_a_number_has_three_digits() -> None:
+    found = [number(value) for value in (None, 1234.6, 100.4, 99.46, 12.345, 0.01234, 7.0, -250.4)]
+    assert found == ["-", "1235", "100", "99.5", "12.3", "0.0123", "7", "-250"]
+    assert number(0.12345, 100.0) == "12.3"
 
 
 def test_figures_that_no_run_has_are_a_line_and_those_that_one_lacks_are_a_dash() -> None:
@@ -117,9 +159,13 @@ def test_runs_of_several_states_of_the_code_are_named() -> None:
 
 
 def test_it_is_said_how_long_all_runs_took_and_which_grids_are_still_warming_up() -> None:
-    runs = [run("A", wall_seconds=300.0), run("B", wall_seconds=300.0, warming_up=True)]
+    runs = [run("A", wall_seconds=300.0), run("B", wall_seconds=840.0, warming_up=True)]
     text = table(results(*runs, protocol={"seconds": 10.0, "steps": None, "at_once": 2}))
-    assert "All runs together took 5 min." in text
+    assert "All runs together took 10 min." in text
+    assert "of the runs were made" not in text and "took" not in table(results(*runs, run("C")))
+    assert "All runs together took 19 min." in table(results(*runs))
+    reused = [one | {"reused": number > 0} for number, one in enumerate([*runs, run("C")])]
+    assert " 2 of the runs were made for other charts." in table(results(*reused))
     assert "Ended in the warm-up of their grid, which asks all cells: B." in text
 
 

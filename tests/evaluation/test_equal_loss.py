@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
+from ball_occupancy import ball
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from nerfstudio.cameras.cameras import Cameras
@@ -28,6 +30,7 @@ from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.dense import Reference
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.rendering import Intervals, Rays
+from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.scenes.city.city import CityConfig
 from leco_plugin.scenes.city.folder import CaptureConfig, CityTruth, write_city
@@ -324,6 +327,84 @@ def test_rays_fill_the_photographs_and_stay_inside_them() -> None:
         assert bool((slopes[chosen].abs() <= ends + 1e-4).all())
         assert bool((slopes[chosen].amax(dim=0) > 0.95 * ends).all())
         assert bool((slopes[chosen].amin(dim=0) < -0.95 * ends).all())
+
+
+def test_candidates_of_rays_are_mapped_middles_without_backdrops(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(equal_loss, "CALIBRATION", CalibrationConfig(rays_at_once=3))
+    made, bundle = small_mixture(), rays_of_photographs(photographs(), 7)
+    made.region.space.set("contraction", torch.tensor([0.5, -1.0, 0.25]), 2.0)
+    rays = made.rays(bundle.origins, bundle.directions, None)
+    intervals = made.with_backdrops(rays, made.candidates(rays))
+    middles = (intervals.t_starts + intervals.t_ends) / 2
+    of_ray = intervals.ray_indices
+    last = intervals.t_ends >= rays.t_maxs[of_ray]
+    places = rays.origins[of_ray] + middles[:, None] * rays.directions[of_ray]
+    expected = made.region.space.map(places[~last])
+    assert int(last.sum()) > 0 and len(expected) > 7 * 16
+    torch.testing.assert_close(equal_loss.candidates_of(made, bundle), expected)
+
+
+def test_reached_volume_is_drawn_in_the_box_and_mapped(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = small_mixture()
+    low, high = torch.tensor([-0.5, -0.25, 1.0]), torch.tensor([2.5, 0.75, 1.5])
+    middle, walls = torch.tensor([1.0, 0.5, 1.0]), torch.cat([low, high])
+    made.set_bounds(SceneBounds("box", middle, 2.0, 0.1, 4.0, walls, "test"), 1.0)
+    made.report = {"aabb": walls.tolist()}
+    everywhere = torch.cartesian_prod(*[(torch.arange(CELLS) + 0.5) / CELLS * 2.0 - 1.0] * 3)
+    found = equal_loss.reached_volume(made, everywhere, 2000)
+    ends = torch.tensor([[-0.75, -0.375, 0.0], [0.75, 0.125, 0.25]])
+    drawn = torch.stack([found.amin(dim=0), found.amax(dim=0)])
+    torch.testing.assert_close(drawn, ends, atol=5e-3, rtol=0.0)
+    box = equal_loss.mapped_box(made)
+    torch.testing.assert_close(torch.stack([box.low, box.high]), ends)
+    lower = everywhere[everywhere[:, 2] < 0.125]  # half of the box
+    assert len(equal_loss.reached_volume(made, lower, 2000)) == pytest.approx(1000, abs=70)
+
+
+def test_the_score_of_a_place_is_how_near_the_closest_point_is() -> None:
+    score = equal_loss.near_points(torch.tensor([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]]))
+    places = torch.tensor([[1.0, 0.0, 0.0], [3.0, 4.0, 0.0], [2.5, 0.0, 0.0]])
+    assert score(places).tolist() == [-1.0, -4.0, -0.5]
+
+
+def test_an_occupancy_is_held_beside_the_city_under_its_highest_camera(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, scene, out = (tmp_path / name for name in ("run", "scene", "out"))
+    for folder in (run, scene, out):
+        folder.mkdir()
+    poses = torch.eye(4)[None, :3].repeat(3, 1, 1)
+    poses[:, :, 3] = torch.tensor([[9.0, 8.0, 0.5], [7.0, 6.0, 1.5], [5.0, 4.0, 1.0]])
+    cameras = SimpleNamespace(camera_to_worlds=poses)
+    manager = SimpleNamespace(
+        train_dataset=SimpleNamespace(cameras=cameras), train_dataparser_outputs="outputs"
+    )
+    pipeline = SimpleNamespace(device="cpu", datamanager=manager)
+    trainer = SimpleNamespace(base_dir=run, pipeline=pipeline)
+    assert equal_loss.take_occupancy(trainer, scene, out) is None
+    known = ball()
+    report = {name: 0.1 * i for i, name in enumerate(equal_loss.FROM_REPORT)}
+    report |= {"aabb": [1.0, 2.0, 3.0, 4.0, 5.0, 6.0], "step_size": 0.07, "recoveries": 3}
+    Occupancy(known.gate, known.space, 0.5, report=report).save(run / "occupancy.safetensors")
+    taken = equal_loss.take_occupancy(trainer, scene, out)
+    assert taken is not None and taken[2] is None  # no city
+    size = (out / "occupancy.safetensors").stat().st_size
+    expected = {name: report[name] for name in (*equal_loss.FROM_REPORT, "recoveries")}
+    expected |= {"kept_surface_recall": None, "free_space_skipped": None, "bytes": size}
+    assert expected.items() <= taken[1].items() and taken[1]["params"] == known.num_params
+    (scene / equal_loss.DESCRIPTION).touch()
+    asked = []
+    monkeypatch.setattr(CityTruth, "from_dataparser", lambda *given: given)
+    monkeypatch.setattr(
+        equal_loss, "compare_with_truth", lambda _, *rest: asked.append(rest) or {"recall": 1.0}
+    )
+    taken = equal_loss.take_occupancy(trainer, scene, out)
+    assert taken is not None and taken[1]["recall"] == 1.0
+    ((truth, box, step, highest),) = asked
+    assert truth == taken[2] == (scene, "outputs") and box.tolist() == report["aabb"]
+    assert (step, highest) == (0.07, 1.5)
 
 
 def test_rays_are_the_same_each_time_and_use_no_random_numbers_of_training() -> None:

@@ -100,6 +100,14 @@ def test_lines_of_a_film_end_at_its_look(run: Path) -> None:
     for look, figure in enumerate(film.moving([0, 1, 2])):
         for axes in figure.axes[2:]:
             assert [list(line.get_xdata()) for line in axes.lines] == [[0, 10, 20][: look + 1]] * 3
+        for axes, ends in zip(figure.axes[2:], ((50.0, 50.0, 0.0), (0.1, 9.0, 0.0))):
+            assert [line.get_ydata()[-1] for line in axes.lines] == pytest.approx(ends)
+            assert axes.get_xlim() == (0.0, 20.0)
+    box = history_picture.interesting_box(ball(), history_picture.cameras_of(ball()))
+    low, high = history_picture.heights_seen_from_above(ball(), box)
+    (above, height), (beside, y) = film.places
+    assert (above, beside) == (2, 1) and height == pytest.approx(low + 0.12 * (high - low))
+    assert y == pytest.approx(2.0, abs=0.1)  # the ball's middle
 
 
 def test_a_still_picture_is_drawn_too(run: Path) -> None:

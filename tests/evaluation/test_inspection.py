@@ -10,15 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from ball_occupancy import CENTRE, HALF, RADIUS, ball
+from ball_occupancy import CENTRE, HALF, RADIUS, WALLS, ball
 from PIL import Image
 
+from leco_plugin.evaluation import occupancy_picture
 from leco_plugin.evaluation.inspection import (
     KEPT,
     SKIPPED,
     UNSEEN,
     ViewBox,
     cameras_of,
+    candidates,
     describe,
     exposed,
     ray_states,
@@ -28,6 +30,7 @@ from leco_plugin.evaluation.occupancy_picture import (
     HORIZONTAL,
     differing_heights,
     draw,
+    draw_slice,
     headline,
     heights_seen_from_above,
     interesting_box,
@@ -43,6 +46,40 @@ def with_report(**report: object) -> Occupancy:
     """The ball with another report."""
     known = ball()
     return Occupancy(known.gate, known.space, known.threshold, report=report)
+
+
+def test_cells_of_a_box_are_nearly_cubes_with_middles() -> None:
+    box = ViewBox(torch.tensor([1.0, -2.0, 0.5]), torch.tensor([5.0, 0.0, 0.6]))
+    assert box.cells(8) == (8, 4, 2) and box.middles(8).shape == (8, 4, 2, 3)
+    for x, y, z in np.ndindex(8, 4, 2):
+        middle = (1.25 + 0.5 * x, -1.75 + 0.5 * y, 0.525 + 0.05 * z)
+        assert box.middles(8)[x, y, z].tolist() == pytest.approx(middle)
+    drawn = box.draw(2000, seed=3)
+    assert torch.equal(drawn, box.draw(2000, seed=3)) and not torch.equal(drawn, box.draw(2000))
+    shares = (drawn - box.low) / (box.high - box.low)
+    assert bool((shares.amin(dim=0).abs() < 0.01).all() and (shares.amax(dim=0) > 0.99).all())
+    assert bool(((shares.mean(dim=0) - 0.5).abs() < 0.03).all())
+
+
+def test_candidates_lie_evenly_between_the_walls_the_reach_and_the_crop_of_a_ray() -> None:
+    """Rays straight down meet the walls at z = 2 and z = -1; steps are a 192nd of the cube."""
+    origins = torch.tensor([[1.0, 2.0, 10.0], [1.0, 3.0, 0.5], [1.0, 2.0, 10.0]])
+    down = torch.tensor([[0.0, 0.0, -1.0]]).expand(3, 3)
+    crop = torch.tensor([0.0, 0.0, 9.0]), torch.tensor([20.0, 20.0, 10.0])
+    of_ray, starts, ends = candidates(ball(), origins, down, crop)
+    step = 2.0 * HALF / 192
+    for ray, (first, last) in enumerate(((8.0, 11.0), (0.02 * HALF, 1.5), (9.0, 10.0))):
+        mine = of_ray == ray
+        assert float(starts[mine].min()) == pytest.approx(first, abs=1e-5)
+        assert float(ends[mine].max()) == pytest.approx(last, abs=step)
+        assert int(mine.sum()) == pytest.approx((last - first) / step, abs=1.0)
+
+
+def test_the_seen_share_is_that_of_the_box() -> None:
+    known = ball()
+    partly = Occupancy(known.gate, known.space, 0.5, report=known.report).eval()
+    partly.seen.cells[:, 48:] = False  # of 64 cells in y
+    assert describe(partly)["seen_share_of_box"] == pytest.approx(0.75, abs=0.01)
 
 
 def test_the_kept_share_is_that_of_the_ball_in_the_box_between_the_walls() -> None:
@@ -74,8 +111,15 @@ def test_a_report_that_says_nothing_useful_is_done_without(report: dict[str, obj
 def test_what_is_drawn_is_what_is_kept_and_the_cameras() -> None:
     alone, watched = (interesting_box(ball(), c) for c in (NO_CAMERAS, cameras_of(ball())))
     low, high = torch.tensor(CENTRE) - RADIUS, torch.tensor(CENTRE) + RADIUS
-    assert bool(((alone.low - low).abs() < 0.3).all() and ((alone.high - high).abs() < 0.3).all())
+    margin = 0.04 * 2.0 * RADIUS + (torch.tensor([4.0, 4.0, 3.0]) - 2.0) / 64
+    assert bool(((alone.low - low + margin).abs() < 0.07).all())
+    assert bool(((alone.high - high - margin).abs() < 0.07).all())
+    everything = Occupancy(ball().gate, ball().space, 0.0, report=ball().report, walls=WALLS)
+    box, whole = interesting_box(everything, NO_CAMERAS), whole_box(everything)
+    assert torch.equal(box.low, whole.low) and torch.equal(box.high, whole.high)
     assert float(watched.high[2]) > 1.8
+    above = interesting_box(ball(), cameras_of(ball()) + torch.tensor([0.0, 0.0, 0.5]))
+    assert torch.equal(above.low, alone.low) and torch.equal(above.high, alone.high)
 
 
 def test_a_camera_far_from_all_others_does_not_shrink_what_is_drawn() -> None:
@@ -102,6 +146,12 @@ def test_points_of_a_picture_begin_two_cells_below_the_ground() -> None:
     assert ground - 2.0 * cell <= float(points[:, 2].min()) < ground - cell
 
 
+def few_others(at: torch.Tensor, usual: torch.Tensor) -> torch.Tensor:
+    """Heights of the ground: a ditch in 3% of all columns, a pole in 0.1%, `usual` elsewhere."""
+    x, y, _ = at.unbind(dim=-1)
+    return usual.where(x > 0.12, 0.2).where((x < 3.9) | (y < 2.9), 3.9)
+
+
 @pytest.mark.parametrize(
     ("kept", "seen"),
     [
@@ -110,15 +160,16 @@ def test_points_of_a_picture_begin_two_cells_below_the_ground() -> None:
         (lambda at: at[:, 2] > 9.0, (0.0, 4.0)),
         (lambda at: (at[:, 2] - 2.0).abs() < 0.03, (1.95, 2.08)),
         (lambda at: at[:, 2] < torch.where(at[:, 0] < 2.0, 1.0, 3.0), (0.98, 2.98)),
+        (lambda at: at[:, 2] < few_others(at, torch.where(at[:, 0] < 2.0, 1.0, 3.0)), (0.98, 2.98)),
     ],
-    ids=["all", "nearly all", "nothing", "a layer", "a step"],
+    ids=["all", "nearly all", "nothing", "a layer", "a step", "a ditch and a pole"],
 )
 def test_heights_are_those_of_what_is_met_from_above(kept: Any, seen: tuple[float, float]) -> None:
     value = torch.tensor(0.5)
     known: Any = SimpleNamespace(
         threshold=0.5, threshold_value=value, query=lambda at: kept(at).float()
     )
-    box = ViewBox(torch.zeros(3), torch.full((3,), 4.0))
+    box = ViewBox(torch.zeros(3), torch.tensor([4.0, 3.0, 4.0]))
     assert heights_seen_from_above(kept_cells(known, box)) == pytest.approx(seen, abs=0.05)
 
 
@@ -155,6 +206,72 @@ def test_a_picture_is_made_whatever_is_kept(tmp_path: Path, threshold: float) ->
     occupancy = Occupancy(known.gate, known.space, threshold, report=known.report)
     image = np.asarray(Image.open(draw(occupancy, tmp_path / "picture.png")).convert("L"))
     assert min(image.shape) > 600 and image.std() > 30
+
+
+class Axes:
+    """Notes what is asked of it."""
+
+    def __init__(self) -> None:
+        self.asked: dict[str, list[tuple[tuple[Any, ...], dict[str, Any]]]] = {}
+
+    def __getattr__(self, name: str) -> Any:
+        def ask(*args: Any, **options: Any) -> Any:
+            self.asked.setdefault(name, []).append((args, options))
+            return SimpleNamespace(set_edgecolor=lambda colour: None)
+
+        return ask
+
+
+def test_a_slice_shows_o_where_its_axes_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    def value(at: torch.Tensor) -> torch.Tensor:
+        return at @ torch.tensor([0.1, 0.3, 0.2])
+
+    known: Any = SimpleNamespace(threshold=0.25, threshold_value=torch.tensor(0.25), query=value)
+    monkeypatch.setattr(occupancy_picture.inspection, "seen_at", lambda _, at: at[..., 0] < 4.0)
+    box = ViewBox(torch.tensor([1.0, -2.0, 0.5]), torch.tensor([5.0, 0.0, 1.0]))
+    cameras, under = torch.tensor([[2.0, -1.0, 0.7], [3.0, -1.5, 0.9]]), np.zeros((2, 3, 4))
+    axes = Axes()
+    draw_slice(
+        axes, known, box, 1, -0.5, cameras, lambda at: at[:, 2] > 0.8, pixels=100, under=under
+    )
+    x, z = 1.0 + 0.04 * (np.arange(100) + 0.5), 0.5 + 0.5 * (np.arange(64) + 0.5) / 64
+    shown = 0.1 * x - 0.3 * 0.5 + 0.2 * z[:, None]
+    (below, its), ((values,), options) = axes.asked["imshow"]
+    np.testing.assert_allclose(values, shown, rtol=1e-5)
+    np.testing.assert_allclose(options["alpha"], np.minimum(shown / 0.75, 1.0), rtol=1e-5)
+    assert below[0] is under and its["extent"] == options["extent"] == (1.0, 5.0, 0.5, 1.0)
+    assert its["origin"] == options["origin"] == "lower"
+    assert its["aspect"] == options["aspect"] == 2.0  # a quarter as high as it is wide
+    (((u, v, unseen), _),) = axes.asked["contourf"]
+    np.testing.assert_allclose(u, x, rtol=1e-5)
+    np.testing.assert_allclose(v, z, rtol=1e-5)
+    assert (unseen == np.broadcast_to(x >= 4.0, unseen.shape)).all()
+    at_threshold, *solid = axes.asked["contour"]
+    assert at_threshold[1]["levels"] == [0.25] and len(solid) == 2
+    for (_, _, inside), options in solid:
+        assert options["levels"] == [0.5]
+        assert (inside.numpy() == np.broadcast_to(z[:, None] > 0.8, inside.shape)).all()
+    ((places, _),) = axes.asked["scatter"]
+    torch.testing.assert_close(torch.stack(places), cameras[:, [0, 2]].T)
+    assert {"xlim": (1.0, 5.0), "ylim": (0.5, 1.0)} in [options for _, options in axes.asked["set"]]
+    assert {"xlabel": "x", "ylabel": "z"} in [options for _, options in axes.asked["set"]]
+    (((title,), _),) = axes.asked["set_title"]
+    assert title == "o(x) at y = -0.5, z drawn 2.0 times as long"
+
+
+def test_points_are_coloured_by_height_and_lit_from_above() -> None:
+    from matplotlib import colormaps
+
+    light = torch.nn.functional.normalize(torch.tensor([0.35, -0.55, 0.75]), dim=0)
+    points = torch.tensor([[0.0, 0.0, 1.0], [2.0, 0.0, 2.0], [0.0, 3.0, 6.0]])
+    axes = Axes()
+    normals = torch.stack([light, -light, light])
+    occupancy_picture._draw_points(axes, points, normals, (1.0, 5.0))
+    (((x, y, z), options),) = axes.asked["scatter"]
+    assert (x.tolist(), y.tolist(), z.tolist()) == tuple(points.T.tolist())
+    paint, shade = colormaps["viridis"](np.array([0.0, 0.25, 1.0]))[:, :3], [[1.0], [0.55], [1.0]]
+    np.testing.assert_allclose(options["c"], paint * shade, rtol=1e-5)
+    assert axes.asked["set_box_aspect"] == [(([2.0, 3.0, 5.0],), {"zoom": 1.4})]
 
 
 def test_exposed_cells_are_those_with_a_skipped_neighbour() -> None:

@@ -43,7 +43,7 @@ def backbone(hub: Path) -> Path:
 
 
 def images(side: int = 40) -> tuple[torch.Tensor, torch.Tensor]:
-    truth = torch.rand(side, side + 3, 3)
+    truth = torch.rand(side + 3, side, 3)
     return (truth + 0.1 * torch.randn_like(truth)).clamp(0, 1), truth
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
 from scene_files import refused
@@ -14,6 +17,7 @@ from leco_plugin.scenes.bounds import (
     SceneBounds,
     distances_from_middle,
     find_bounds,
+    raise_to_cameras,
     with_range,
 )
 
@@ -29,11 +33,13 @@ def image_rays(poses: Tensor) -> Tensor:
 def from_above(scale: float = 1.0) -> tuple[Tensor, Tensor, Tensor]:
     """16 cameras 10 above a ground with hills of 1, looking down: poses, directions, points."""
     poses = torch.eye(4)[:3].repeat(16, 1, 1)
-    poses[:, :2, 3] = torch.cartesian_prod(*[torch.linspace(-6.0, 6.0, 4)] * 2)
+    poses[:, :2, 3] = torch.cartesian_prod(
+        torch.linspace(-6.0, 6.0, 4), torch.linspace(-3.0, 5.0, 4)
+    )
     poses[:, 2, 3] = 10.0
     generator = torch.Generator().manual_seed(0)
-    points = torch.rand(2000, 3, generator=generator) * torch.tensor([16.0, 16.0, 1.0])
-    points[:, :2] -= 8.0
+    points = torch.rand(2000, 3, generator=generator) * torch.tensor([16.0, 14.0, 1.0])
+    points[:, :2] -= torch.tensor([8.0, 6.0])
     poses[:, :, 3] *= scale
     return poses, image_rays(poses), points * scale
 
@@ -81,6 +87,59 @@ def test_bounds_are_of_all_points_but_one_in_a_thousand_at_either_end() -> None:
     inner = find_bounds(poses, directions, points, BoundsConfig(space="contraction"))
     assert inner.half_extent == pytest.approx(float((ends[1] - ends[0]).max()) / 2, rel=1e-5)
     torch.testing.assert_close(inner.center, ends.mean(dim=0))
+
+
+@pytest.mark.parametrize("height", [0.0, 1.0, 20.0])
+def test_a_box_has_room_below_and_above_its_points_and_all_that_rays_reach(height: float) -> None:
+    poses, directions, points = from_above()
+    poses[:, 2, 3] += height
+    points[:, 2] *= height
+    found = find_bounds(poses, directions, points)
+    levels = points[:, 2].sort().values
+    low, high = (float(levels[round(share * 1999)]) for share in (0.001, 0.999))
+    relief = max(high - low, 0.02 * found.far)
+    ground, top = low - max(0.5 * relief, 0.2 * found.far), high + 0.3 * relief
+    assert found.aabb[[2, 5]].tolist() == pytest.approx([ground, top], rel=1e-5)
+    assert (0.5 * relief > 0.2 * found.far) == (height == 20.0)
+    reach = ((ground - poses[:, None, 2, 3]) / directions[..., 2]).clamp(max=found.far)
+    hits = poses[:, None, :, 3] + directions * reach[..., None]
+    ends = torch.stack([hits.amin(dim=(0, 1)), hits.amax(dim=(0, 1))])[:, :2]
+    middle = [*ends.mean(dim=0).tolist(), (ground + top) / 2]
+    assert found.center.tolist() == pytest.approx(middle, abs=1e-4)
+    longest = max(*(ends[1] - ends[0]).tolist(), top - ground)
+    assert found.half_extent == pytest.approx(1.02 * longest / 2, rel=1e-4)
+
+
+@pytest.mark.parametrize(("below", "up", "kind"), [(4, 39, "box"), (5, 0, ""), (0, 41, "")])
+def test_a_scene_is_from_above_where_nearly_all_cameras_and_rays_say_so(
+    below: int, up: int, kind: str
+) -> None:
+    """Three quarters of 16 cameras, and nine tenths of 400 rays."""
+    poses, directions, points = from_above()
+    poses[:below, 2, 3] = 0.9 * points[:, 2].max()
+    directions.view(-1, 3)[:up] = torch.tensor([0.0, 0.0, 1.0])
+    assert find_bounds(poses, directions, points).kind == (kind or "contraction")
+
+
+def test_bounds_are_raised_over_the_highest_camera() -> None:
+    box = torch.tensor([-3.0, -1.0, -1.0, 1.0, 3.0, 2.0])
+    low = SceneBounds("box", torch.tensor([-1.0, 1.0, 0.5]), 2.0, 1.5, 20.0, box, "seen", -0.5)
+    heights = torch.tensor([4.0, 9.0, 6.0])
+    found, as_high = raise_to_cameras(low, heights, 0.125), raise_to_cameras(low, heights / 9, 0.1)
+    assert found.aabb.tolist() == pytest.approx([-6.406, -4.406, -1.0, 4.406, 6.406, 9.6])
+    assert found.center.tolist() == pytest.approx([-1.0, 1.0, 4.3])
+    assert found.half_extent == pytest.approx(1.02 * 10.6 / 2)
+    assert (found.near, found.far, found.lowest) == (0.8, 20.0, -0.5)
+    assert "12.5% of the rays" in found.reason
+    assert float(as_high.aabb[5]) == 2.0 and as_high.half_extent == 2.0
+    assert raise_to_cameras(replace(low, near=0.3), heights, 0.1).near == 0.3
+
+
+def test_distances_from_the_middle_are_over_that_of_three_quarters() -> None:
+    places = torch.randn(21, 3, generator=torch.Generator().manual_seed(0)).double()
+    places = places * torch.tensor([1.0, 3.0, 9.0]) + 5.0
+    away = np.linalg.norm(places.numpy() - np.median(places.numpy(), axis=0), axis=1)
+    np.testing.assert_allclose(distances_from_middle(places), away / np.quantile(away, 0.75))
 
 
 def test_a_ray_that_hardly_goes_down_widens_the_box_as_far_as_it_is_marched() -> None:
@@ -211,8 +270,14 @@ def test_bounds_grow_with_the_scene() -> None:
 @pytest.mark.parametrize("points", [None, torch.zeros(3, 3), torch.full((99, 3), float("nan"))])
 def test_without_points_the_cameras_bound_the_scene(points) -> None:
     poses, directions, _ = around()
+    poses[:, :, 3] = poses[:, :, 3] * torch.tensor([1.0, 2.0, 0.5]) + torch.tensor([3.0, 1.0, 2.0])
     bounds = find_bounds(poses, directions, points)
-    assert 0.0 < bounds.near < bounds.far < float("inf")
+    low, high = poses[:, :, 3].amin(dim=0), poses[:, :, 3].amax(dim=0)
+    half = float((high - low).max()) / 2
+    assert (bounds.half_extent, bounds.near, bounds.far) == pytest.approx(
+        (half, 0.05 * half, 100 * half)
+    )
+    torch.testing.assert_close(bounds.center, (low + high) / 2)
     assert bool(((poses[:, :, 3] - bounds.center).abs() <= bounds.half_extent * 1.001).all())
 
 
@@ -249,7 +314,17 @@ def test_what_is_chosen_can_be_chosen_by_hand() -> None:
 
 def test_walls_by_hand_hold_cameras_and_points() -> None:
     poses, directions, points = around()
-    low, high = find_bounds(poses, directions, points, BoundsConfig(space="box")).aabb.view(2, 3)
+    poses[:, :, 3] += torch.tensor([0.0, 0.5, 0.0])
+    poses[0, 2, 3] += 2.0
+    found = find_bounds(poses, directions, points, BoundsConfig(space="box"))
+    low, high = found.aabb.view(2, 3)
+    both = torch.cat([poses[:, :, 3], points])
+    sides = both.amax(dim=0) - both.amin(dim=0)
+    margin = 0.125 * float(sides.max())
+    torch.testing.assert_close(low, both.amin(dim=0) - margin, rtol=0.0, atol=0.01)
+    torch.testing.assert_close(high, both.amax(dim=0) + margin, rtol=0.0, atol=0.01)
+    assert found.half_extent == pytest.approx(float(sides.max()) / 2 + margin, abs=0.01)
+    torch.testing.assert_close(found.center, (low + high) / 2)
     for places in (poses[:, :, 3], points):
         assert bool((places >= low).all()) and bool((places <= high).all())
 

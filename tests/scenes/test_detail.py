@@ -70,6 +70,16 @@ def test_the_footprint_of_a_pixel_is_exact_however_few_an_image_has() -> None:
     assert float(_pixel_density(torch.zeros(1, 3), pose, directions[0], 8)) == pytest.approx(16.0)
 
 
+def test_a_wide_image_is_as_wide_as_it_is_and_no_higher() -> None:
+    pose = torch.eye(4)[:3]
+    pose[:, 3] = torch.tensor([1.0, 0.0, 2.0])
+    camera = Cameras(pose[None], 8.0, 6.0, 4.0, 2.0, 8, 4)
+    _, directions = covering_rays(camera)
+    places = torch.tensor([[1.7, 0.0, 0.0], [1.0, 0.7, 0.0], [0.2, 0.3, 0.0], [1.0, 0.0, 5.0]])
+    found = _pixel_density(places, pose, directions[0], 8)
+    assert found.tolist() == pytest.approx([16.0, 0.0, 16.0, 0.0])
+
+
 @pytest.mark.parametrize(("space", "halves"), [("box", 2), ("contraction", 4)])
 def test_a_contraction_is_twice_as_many_pixels_across_as_its_inner_cube(
     space: Any, halves: int

@@ -16,6 +16,7 @@ from leco_plugin.scenes.frames import (
     between,
     box_around,
     distance_from_rotations,
+    found_again,
     frame_of,
     from_file,
     inverse,
@@ -66,6 +67,13 @@ def test_an_inverse_takes_positions_back():
     there = moved(points, frame)
     torch.testing.assert_close(there, points @ frame[:, :3].T + frame[:, 3])
     torch.testing.assert_close(moved(there, back), points)
+
+
+def test_a_camera_is_found_again_within_a_thousandth_of_the_half_extent():
+    known, here = torch.zeros(1, 3), torch.tensor([[5.0, 0.0, 0.0], [0.0, 0.0019, 0.0]])
+    assert found_again(known, here, 2.0).tolist() == [True]
+    assert found_again(known, here, 1.8).tolist() == [False]
+    assert found_again(here, torch.zeros(1, 3), 2.0).tolist() == [False, True]
 
 
 def test_a_turned_box_holds_the_box_and_no_more():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from types import SimpleNamespace
 from typing import Any
 
@@ -53,6 +54,19 @@ def test_rays_cover_each_image_and_are_of_unit_length() -> None:
     origins, directions = covering_rays(ring())
     assert origins.shape == directions.shape == (8, SIDE * SIDE, 3)
     torch.testing.assert_close(directions.norm(dim=-1), torch.ones(8, SIDE * SIDE))
+    poses, sizes = ring(2).camera_to_worlds, ((24, 40), (30, 20))
+    cameras = Cameras(
+        *(poses, torch.tensor([[30.0], [25.0]]), torch.tensor([[32.0], [20.0]])),
+        *(torch.tensor([[19.0], [9.0]]), torch.tensor([[13.0], [14.0]])),
+        width=torch.tensor([[40], [20]]),
+        height=torch.tensor([[24], [30]]),
+    )
+    _, directions = covering_rays(cameras)
+    for camera, row, column in itertools.product((0, 1), (0, 3, SIDE - 1), (0, 2, SIDE - 1)):
+        shares = torch.tensor([row, column]) / (SIDE - 1)
+        place = 0.5 + shares * (torch.tensor(sizes[camera]) - 1)
+        expected = cameras.generate_rays(camera, coords=place[None]).directions[0]
+        torch.testing.assert_close(directions[camera, row * SIDE + column], expected)
 
 
 def test_a_ring_of_cameras_sees_its_scene() -> None:
@@ -76,11 +90,11 @@ def test_rays_that_never_meet_the_scene_are_refused_in_one_line() -> None:
 
 
 def drone(count: int = 12) -> Cameras:
-    """Cameras 10 above the origin that look straight down."""
+    """Cameras 9 to 10 above the origin that look straight down."""
     poses = torch.eye(4)[:3].repeat(count, 1, 1)
-    poses[:, :, 3] = torch.tensor([0.0, 0.0, 10.0])
+    poses[:, 2, 3] = torch.linspace(9.0, 10.0, count)
     poses[:, 0, 3] = torch.linspace(-5.0, 5.0, count)
-    return Cameras(poses, 32.0, 32.0, 16.0, 16.0, 32, 32)
+    return Cameras(poses, 32.0, 30.0, 20.0, 12.0, 40, 24)
 
 
 def ground(low: float = 0.0, high: float = 1.0) -> torch.Tensor:
@@ -114,6 +128,18 @@ def test_points_of_colmap_bound_the_scene_and_both_units_stand_side_by_side() ->
     assert metres == pytest.approx(10.0 * scene, abs=0.02)
     scene, metres = columns(lines, "highest camera")
     assert scene == pytest.approx(10.0, abs=1e-3) and metres == pytest.approx(130.0, abs=0.01)
+    assert columns(lines, "lowest camera") == pytest.approx([9.0, 120.0], abs=0.01)
+    found = survey(data, BoundsConfig(metres_per_unit=1.0))
+    for row, value, there in (
+        ("far", found.bounds.far, 10.0 * found.bounds.far),
+        ("ground", float(found.bounds.aabb[2]), 10.0 * float(found.bounds.aabb[2]) + 30.0),
+        ("top", float(found.bounds.aabb[5]), 10.0 * float(found.bounds.aabb[5]) + 30.0),
+    ):
+        assert columns(lines, row) == pytest.approx([value, there], abs=0.01)
+    assert f"{found.median_length:.3f} ({10.0 * found.median_length:.1f} m)" in lines[-1]
+    near, far = found.bounds.near, found.bounds.far
+    said = f"{near:.3g} to {far:.3g} scene units ({10.0 * near:.3g} to {10.0 * far:.3g} metres)"
+    assert said in found.summary()[1]
     assert "data units" in "".join(survey(data).lines())
     assert "100.0% of 768 rays meet the scene" in lines[-1]
 
@@ -302,6 +328,10 @@ def test_what_a_mask_hides_shows_nothing() -> None:
     assert int(bright({"image": image}, chosen).sum()) == 9
     mask[0] = 0.0
     assert int(bright({"image": image, "mask": mask}, chosen).sum()) == 1
+    lamp, grid = torch.zeros(12, 20, 3), torch.zeros(8, 8, dtype=torch.bool)
+    lamp[5, 14] = 1.0  # rows 3 / 7 of 11, columns 5 / 7 of 19
+    grid[3, 5] = grid[5, 3] = True
+    assert bright({"image": lamp}, grid).tolist() == [True, False]
 
 
 def test_rays_that_all_meet_the_scene_open_no_picture() -> None:

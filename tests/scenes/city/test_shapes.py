@@ -11,8 +11,8 @@ STROKES = st.lists(st.tuples(CELL, CELL, CELL, CELL, st.integers(0, 5)), max_siz
 
 
 def painted(strokes: list[tuple[int, int, int, int, int]]) -> tuple[Shapes, np.ndarray]:
-    """The shapes of some strokes on a 10 x 10 canvas, and the heights of its unit cells."""
-    canvas, heights = Canvas((0, 10, 0, 10), paint=0), np.zeros((10, 10))
+    """The shapes of some strokes on a 12 x 10 canvas, and the heights of its unit cells."""
+    canvas, heights = Canvas((0, 12, 0, 10), paint=0), np.zeros((12, 10))
     for number, (a, b, c, d, top) in enumerate(strokes):
         x0, x1, y0, y1 = min(a, b), max(a, b) + 1, min(c, d), max(c, d) + 1
         canvas.stroke((x0, x1, y0, y1), top, number + 1)
@@ -31,7 +31,7 @@ def test_columns_tops_and_walls_add_up_to_the_height_field(strokes: list) -> Non
     sizes = np.array([np.ptp(face, axis=0) for face, _, _ in shapes.rectangles])
     areas = np.where(sizes == 0, 1, sizes).prod(1)
     level = sizes[:, 2] == 0
-    assert areas[level].sum() == 200  # what lies on top, and the underside
+    assert areas[level].sum() == 240  # what lies on top, and the underside
     walls = np.abs(np.diff(heights, axis=0)).sum() + np.abs(np.diff(heights, axis=1)).sum()
     assert areas[~level].sum() == walls
 
