@@ -56,7 +56,7 @@ def test_a_grid_that_cannot_tell_its_cells_apart_keeps_no_more_than_is_asked_for
 def test_a_cell_of_a_grid_has_the_largest_target_of_the_lesson_in_it() -> None:
     mapped = torch.tensor([[-0.5, 0.5, 0.5], [-0.4, 0.6, 0.5], [0.5, -0.5, -0.5], [3.0, 0.0, 0.0]])
     targets = torch.tensor([0.2, 0.7, 0.4, 1.0])
-    box = ViewBox(-torch.ones(3), torch.ones(3))
+    box = ViewBox(torch.tensor([-1.0, -0.6, -1.0]), torch.tensor([1.0, 1.4, 1.8]))
     scores = taught_grid(Lesson(mapped, 8.0 * targets, 1.0 - targets), box, 2)
     expected = torch.zeros(2, 2, 2)
     expected[0, 1, 1], expected[1, 0, 0] = 0.7, 0.4

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -15,6 +17,7 @@ from leco_plugin.capacity.references import (
     Ground,
     Part,
     Reference,
+    declared,
     measure_original,
     verify,
 )
@@ -118,6 +121,37 @@ def test_an_original_is_measured_where_all_candidates_are_rendered() -> None:
     declared = itself.verified["lost_surface_mass_bound"]
     assert declared == pytest.approx(max(searched.bound, unseen.bound))
     assert float(fourth.verified["lost_surface_mass_bound"] or 0.0) > float(declared or 1.0)
+
+
+def test_what_a_gate_skips_and_drops_is_counted_on_rays_that_the_search_did_not_see() -> None:
+    here = ground(True, False)
+    raised, rung = here.original.with_threshold(0.95), measure_original(here, Bounds(0.9))
+    first = here.references[0].verify.evidence
+    skipped = here.original.query(first.positions) < 0.95
+    verify(here, raised, Bounds(0.9), rung, 3)
+    dropped = float((skipped & first.kept).sum()) / float(first.kept.sum())
+    assert rung.look == 3 and rung.verified["empty_fraction"] == float(skipped.double().mean())
+    assert rung.verified["kept_candidates_dropped"] == pytest.approx(dropped) and dropped > 0.0
+    sides = [loss(one.verify.evidence, skipped) for one in here.references]
+    lost = [one.lost_before + side.share for one, side in zip(here.references, sides)]
+    assert rung.verified["lost_surface_mass"] == pytest.approx(max(lost))
+    assert [one["lost_surface_mass"] for one in rung.verified_against] == pytest.approx(lost)
+
+
+@pytest.mark.parametrize(
+    ("bound", "price", "allowed"),
+    [
+        *((1e-3, 0.05, True), (1e-3, None, True), (1.01e-3, None, False)),
+        *((1e-4, 0.051, False), (1.01e-3, 0.01, False), (0.0, -1.0, True)),
+    ],
+)
+def test_bounds_hold_what_lies_on_them(bound: float, price: float | None, allowed: bool) -> None:
+    assert Bounds().allow(bound, price) is allowed
+
+
+def test_a_declared_gain_is_no_licence_to_lose_it_again() -> None:
+    made: Any = SimpleNamespace(report={"a": 0.25, "b": -0.5, "c": None, "d": 1})
+    assert [declared(made, name) for name in "abcde"] == [0.25, 0.0, 0.0, 1.0, 0.0]
 
 
 def test_its_image_price_is_the_worst_that_any_reference_measures() -> None:

@@ -53,6 +53,10 @@ def test_a_ray_meets_a_solid_where_walking_along_it_does(name: str) -> None:
     both = met & np.isfinite(walked)
     assert both.mean() > 0.3 and np.abs(walked[both] - t[both]).max() < 2 * WALK
     assert np.allclose(np.linalg.norm(normals[met], axis=1), 1.0)
+    outside = met & ~inside(SHAPES[name], origins)
+    places = (origins + np.where(met, t, 0.0)[:, None] * directions)[outside]
+    assert not inside(SHAPES[name], places + 1e-6 * normals[outside]).any()
+    assert inside(SHAPES[name], places - 1e-6 * normals[outside]).all()
 
 
 def test_a_ray_meets_the_side_of_a_rod_where_walking_along_it_does() -> None:
@@ -69,6 +73,10 @@ def test_a_ray_meets_the_side_of_a_rod_where_walking_along_it_does() -> None:
     assert len(sides) > 60 and np.abs(walked[sides] - t[sides]).max() < 3 * WALK
     met = np.isfinite(t)
     assert np.allclose(normals[met] @ axis, 0.0) and not met[np.isinf(walked)].any()
+    assert np.allclose(np.linalg.norm(normals[met], axis=1), 1.0)
+    middle = np.array(rod.start) + 0.5 * axis
+    places = origins[sides] + t[sides, None] * directions[sides]
+    assert (((places - middle) * normals[sides]).sum(axis=1) > 0.99 * rod.radius).all()
 
 
 def test_a_room_is_met_from_within() -> None:
@@ -80,6 +88,11 @@ def test_a_pattern_stays_where_it_is_and_within_range() -> None:
     points = np.random.default_rng(0).uniform(-3, 3, (200, 3))
     colours = Paint((0.9, 0.5, 0.2), contrast=0.9).at(points)
     assert colours.min() >= 0.0 and colours.max() <= 1.0 and colours[:, 1].std() > 0.05
+    paint, (fast, slow) = Paint((0.4, 0.2, 0.1), 2.0, 0.5), (2.7 * np.pi / 2, np.pi / 2)
+    waves = 0.6 * np.sin(slow + 0.7) * np.sin(slow) * np.cos(slow / 2)
+    waves += 0.4 * np.sin(fast + 0.7) * np.sin(fast) * np.cos(fast / 2)
+    found = paint.at(np.array([[0.5, 0.5, 0.25]]))
+    np.testing.assert_allclose(found, [(1.0 + 0.5 * waves) * np.array([0.4, 0.2, 0.1])])
 
 
 FLAT = Paint((0.6, 0.6, 0.6), contrast=0.0)

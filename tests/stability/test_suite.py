@@ -112,6 +112,28 @@ def test_the_time_it_takes_is_said_before_and_from_its_own_runs_later(tmp_path: 
     assert more.estimate() == "3 of 6 runs are to be made, 1 at a time: about 30 s"
 
 
+def test_a_run_takes_the_mean_of_its_sampler_or_as_long_as_any(tmp_path: Path) -> None:
+    runs = suite(tmp_path, ("yard",), SAMPLERS).missing()
+    assert sorted(run.job.contender.sampler for run in runs) == ["dense", "grid-128", "learned"]
+    assert plan.core_seconds(runs, []) == 3 * plan.A_RUN
+    stored = [("grid-128", 10.0), ("grid-128", 26.0), ("dense", 5.0)]
+    records = [{"sampler": name, "processor_seconds": seconds} for name, seconds in stored]
+    assert plan.core_seconds(runs, records) == 18.0 + 5.0 + 26.0
+
+
+def test_pictures_are_as_many_and_as_large_as_the_sizes_say() -> None:
+    (yard,) = cases_named(("yard",))
+    sizes = replace(TINY, picture=0.5, views=0.25)
+    capture = replace(yard.capture, width=60, height=40, test_views=20)
+    found = plan.capture_of(replace(yard, capture=capture), sizes)
+    assert (found.width, found.height, found.test_views) == (30, 20, 5)
+    assert found.views == round(0.25 * capture.views)
+    few = plan.capture_of(replace(yard, capture=replace(capture, views=3, test_views=2)), sizes)
+    assert (few.views, few.test_views) == (4, 2)
+    fixed = plan.capture_of(replace(yard, capture=replace(capture, views=7)), sizes)
+    assert fixed.views == 7  # a case that fixes the number keeps it
+
+
 def test_one_run_is_made_by_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(suite_module, "usable_cores", lambda: 64)
     made = suite(tmp_path, ("yard",), ("dense",))
