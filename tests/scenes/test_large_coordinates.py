@@ -39,6 +39,7 @@ from scene_files import change, described, write_colmap, write_ply
 
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig
 from leco_plugin.scenes.frames import POINTS, data_frame_of, frame_of, inverse, moved
+from leco_plugin.scenes.large_coordinates import FAR, _rounding, far_origin
 from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig
 from leco_plugin.scenes.mega_nerf_files import Coordinates
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
@@ -341,3 +342,15 @@ def test_points_and_frame_of_mega_nerfs_format_keep_their_metres(
     manager = SimpleNamespace(train_dataparser_outputs=outputs)
     found = in_the_data(manager, places)
     np.testing.assert_allclose(found, cameras[trained], atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize(("share", "is_far"), [(0.99, False), (1.01, True)])
+def test_coordinates_are_large_beside_the_spread_of_the_cameras(share: float, is_far: bool) -> None:
+    """The median distance from the middle is 2."""
+    around = np.array([[0.0, 0.0, 0.0], [1.0, 0, 0], [-2.0, 0, 0], [0, 2.0, 0], [0, 0, 90.0]])
+    away = share * FAR * 2.0 * np.array([0.6, -0.8, 0.0])
+    found = far_origin(around + away)
+    assert (found is not None) == is_far
+    if found is not None:
+        np.testing.assert_allclose(found, away)
+        assert _rounding(np.array([-5_200_000.5, 500_000.25, 300.0])) == 0.5

@@ -16,7 +16,13 @@ from PIL import Image
 from scene_files import refused
 
 from leco_plugin.scenes.city.cameras import look_at
-from leco_plugin.scenes.mega_nerf_files import TO_DRB, around, read_scene, wrong_axis
+from leco_plugin.scenes.mega_nerf_files import (
+    TO_DRB,
+    Coordinates,
+    around,
+    read_scene,
+    wrong_axis,
+)
 from leco_plugin.studio.checkpoints import allow_checkpoint_globals
 
 
@@ -281,3 +287,27 @@ def test_the_trap_of_poses_aligned_to_east_north_up_is_found() -> None:
     from_rdf = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     fault = wrong_axis(from_rdf @ SURVEYS["drone"])
     assert fault is not None and "the cameras look back" in fault
+
+
+def test_coordinates_have_metres_an_origin_and_a_datum() -> None:
+    known = Coordinates(np.array([100.0, 20.0, -30.0]), 4.0)
+    in_metres = np.random.default_rng(0).normal(size=(5, 3, 4)) * [1.0, 1.0, 1.0, 50.0]
+    of_file = known.to_file(in_metres)
+    right, forward, up = in_metres[:, :, 3].T
+    np.testing.assert_allclose(of_file[:, 0, 3], (-up - 100.0) / 4.0)
+    np.testing.assert_allclose(of_file[:, 1, 3], (right - 20.0) / 4.0)
+    np.testing.assert_allclose(of_file[:, 2, 3], (-forward + 30.0) / 4.0)
+    np.testing.assert_allclose(of_file[:, 0, :3], -in_metres[:, 2, :3])
+    np.testing.assert_allclose(known.altitudes(of_file), up)
+    model = known.to_model(of_file)
+    np.testing.assert_allclose(model[:, 2, 3], (up + 100.0) / 4.0)
+    np.testing.assert_allclose(known.height_of(-up[0]), model[0, 2, 3])
+    drb = np.array([-up[0], right[0], -forward[0], 1.0])
+    np.testing.assert_allclose(known.transform() @ drb / 4.0, model[0, :, 3])
+
+
+def test_cameras_lie_within_one_unit_of_the_middle_of_their_box() -> None:
+    places = np.array([[0.0, 0.0, 10.0], [40.0, 6.0, 12.0], [10.0, 2.0, 30.0]])
+    found = around(places)
+    assert found.origin_drb.tolist() == [-20.0, 20.0, -3.0] and found.metres == 20.0
+    assert around(places[:1]).metres == 1e-3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tracemalloc
 
 import numpy as np
@@ -14,6 +15,9 @@ from leco_plugin.scenes.poses.reconstruction import (
     FEW,
     NEIGHBOURS,
     NEXT,
+    _around,
+    _in_order,
+    _near,
     capture_order,
     choose_pairs,
     choose_posed_pairs,
@@ -76,11 +80,33 @@ def test_photographs_without_gps_are_compared_with_what_is_next_to_them() -> Non
     assert sum(77 in pair for pair in unordered.pairs) == 199
 
 
-@pytest.mark.parametrize("spread", [0.5, 200.0])
-def test_gps_decides_only_where_it_is_finer_than_the_survey(spread: float) -> None:
-    places = spread * np.random.default_rng(0).normal(size=(90, 3))
-    found = choose_pairs(names(90), [Exif()] * 90, places)
-    assert (found.reason == "all pairs") == (spread < 1.0)
+@pytest.mark.parametrize("spread", [0.5, 19.9, 20.1, 200.0])
+@pytest.mark.parametrize("known", [44, 45, 90])
+def test_gps_decides_only_where_it_is_finer_than_the_survey(spread: float, known: int) -> None:
+    """Metres from the middle, in the median, of half of all photographs or more."""
+    places = np.random.default_rng(0).normal(size=(known, 3)) * [1.0, 3.0, 90.0]
+    flat = places[:, :2] - np.median(places[:, :2], axis=0)
+    places *= spread / np.median(np.linalg.norm(flat, axis=1))
+    found = choose_pairs(names(90), [Exif()] * 90, np.concatenate([places, nothing(90 - known)]))
+    assert (found.reason == "all pairs") == (spread < 20.0 or known < 45)
+
+
+def test_pairs_are_those_of_a_loop_over_all_places() -> None:
+    places = np.random.default_rng(1).normal(size=(30, 2)) * [1.0, 4.0]
+    near, around = set(), set()
+    for one in range(30):
+        others = [other for other in range(30) if other != one]
+        others.sort(key=lambda other: math.dist(places[one], places[other]))
+        near |= {tuple(sorted((one, others[rank]))) for rank in (0, 1, 5)}
+        taken = [0] * 8
+        for other in others:
+            east, north = places[other] - places[one]
+            sector = round(math.degrees(math.atan2(north, east)) / 45.0) % 8
+            if taken[sector] < 2:
+                taken[sector] += 1
+                around.add(tuple(sorted((one, other))))
+    assert _near(places, np.array([0, 1, 5])) == near and _around(places) == around
+    assert _in_order([3, 0, 2, 1], (1, 3, 9)) == {(0, 3), (0, 2), (1, 2), (1, 3)}
 
 
 def test_gps_that_contradicts_the_order_does_not_decide_alone() -> None:
@@ -114,6 +140,14 @@ def test_time_goes_before_names_and_numbers_count_by_value() -> None:
     assert capture_order(["IMG_1.jpg", "IMG_2.jpg"], timed) == [1, 0]
     assert capture_order(["b.jpg", "a.jpg"], [Exif()] * 2) is None
     assert capture_order(["b7.jpg", "a7.jpg"], [Exif()] * 2) is None
+    times = [
+        [Exif(time=each) for each in order] for order in ((3.0, 1.0, 2.0, 1.0), (2.0, 1.0) * 2)
+    ]
+    unnumbered = ["d.jpg", "c.jpg", "b.jpg", "a.jpg"]
+    assert capture_order(unnumbered, times[0]) == [3, 1, 2, 0]
+    assert capture_order(unnumbered, times[1]) is None, "half of them at one time"
+    assert capture_order(["a2.jpg", "a1.jpg", "b2.jpg", "b1.jpg"], [Exif()] * 4) is None
+    assert capture_order(["a2.jpg", "a1.jpg", "b3.jpg", "b1.jpg"], [Exif()] * 4) == [1, 0, 3, 2]
 
 
 def test_photographs_that_look_another_way_are_not_compared_however_near() -> None:
