@@ -242,6 +242,12 @@ def test_who_rises_or_may_rise_is_named_and_nobody_is_said_to_have_had_enough() 
     assert "C unknown. Still rising: C;" in settling(late)
 
 
+@pytest.mark.parametrize(("end", "rising"), [(20.34, []), (20.36, ["A"])])
+def test_more_than_three_tenths_of_a_decibel_are_a_rise(end: float, rising: list[str]) -> None:
+    curve = [[3.0, 18.0], [6.0, 20.0], [9.0, end]]
+    assert still_rising(lines_of(results(run("A", curve=curve)))) == rising
+
+
 def test_a_grid_that_has_skipped_nothing_yet_is_still_rising() -> None:
     cold = run("grid", curve=STILL, warming_up=True)
     assert still_rising(lines_of(results(run("A", curve=STILL), cold))) == ["grid"]
@@ -255,6 +261,9 @@ def test_a_grid_that_took_the_time_of_training_is_named() -> None:
     lines = lines_of(results(gate, fine))
     assert still_rising(lines) == ["fine"]
     assert "Updated its grid instead of training: fine for 89% of its time." in settling(lines)
+    for seconds, names in ((3.5, []), (3.7, ["fine"])):  # 39% of nine seconds, and 41%
+        spent = lines_of(results(gate, fine | {"learn_seconds": seconds}))
+        assert still_rising(spent) == names and ("instead" in settling(spent)) == bool(names)
 
 
 def test_tables_of_runs_of_equal_time_say_it_and_no_others() -> None:
@@ -279,8 +288,9 @@ def test_runs_that_end_below_their_best_point_are_named_on_table_and_page(tmp_pa
     assert falls(lines_of(results(*one, early))) == (
         "B fell by up to 2.0 dB from its best in 2 of 4 runs"
     )
-    hardly = run("B", curve=[[3.0, 18.0], [6.0, 20.0], [9.0, 19.75]])
-    assert falls(lines_of(results(run("A", curve=STILL), hardly))) is None
+    for end, said in ((19.75, None), (19.71, None), (19.69, "B fell by 0.3 dB from its best")):
+        hardly = run("B", curve=[[3.0, 18.0], [6.0, 20.0], [9.0, end]])
+        assert falls(lines_of(results(run("A", curve=STILL), hardly))) == said
 
 
 NAN, OPEN = math.nan, "undecided"

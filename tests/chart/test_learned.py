@@ -122,7 +122,9 @@ def test_those_that_seeds_do_not_tell_apart_in_both_are_level() -> None:
 
 
 def test_a_gate_that_was_frozen_with_the_last_step_has_guided_nothing() -> None:
-    late = run("A", freeze_seconds=9.95, occupancy=occupancy(51_000, 0.1))
+    late = run("A", freeze_seconds=9.91, occupancy=occupancy(51_000, 0.1))
+    sooner = run("A", freeze_seconds=9.89, occupancy=occupancy(51_000, 0.1))
+    assert learned_of(lines_of(results(sooner)))[0].guided_nothing == 0
     (one,) = learned_of(lines_of(results(late, run("A", 1, occupancy=occupancy(51_000, 0.1)))))
     assert (one.guided_nothing, one.is_measured) == (1, True)
     assert "| 2 of 2, 1 at the end |" in table(

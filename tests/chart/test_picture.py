@@ -19,11 +19,16 @@ from page_text import figure_text
 from PIL import Image
 
 from leco_plugin.chart.page import write_page
+from leco_plugin.chart.panels import Panel, Point
 from leco_plugin.chart.picture import (
+    BAR,
     Boxes,
+    _draw_learning,
     balanced,
     covered,
     draw,
+    draw_curves,
+    draw_panel,
     name_ends,
     name_points,
     rims,
@@ -104,6 +109,81 @@ def test_a_marker_that_others_lie_on_is_larger_than_they_are() -> None:
     under, on, beside, far = rims(axes, [(50.0, 50.0), (50.5, 50.0), (53.0, 50.0), (90.0, 50.0)])
     assert under > on == beside == far == 0.0
     assert rims(axes, []) == []
+    wide = Figure(figsize=(5, 3), dpi=150).add_axes((0.0, 0.0, 1.0, 1.0))
+    wide.set(xlim=(0.0, 360.0), ylim=(0.0, 216.0))  # points
+    places = [(50.0, 50.0), (53.9, 50.0), (50.0, 53.9), (50.0, 45.9), (54.1, 50.0)]
+    assert rims(wide, places) == [8.0, 4.0, 0.0, 0.0, 0.0]
+
+
+def test_what_names_share_with_others_is_an_area() -> None:
+    some = np.array([[0.0, 0.0, 2.0, 1.0], [0.0, 0.0, 1.0, 4.0]])
+    others = np.array([[1.0, 0.5, 3.0, 3.0], [0.5, 2.0, 6.0, 6.0]])
+    assert covered(some, others) == 1.0 * 0.5 + 0.5 * 2.0
+
+
+def points_at(*places: tuple[float, float], less: bool = True, more_x: bool = False) -> Panel:
+    return Panel("a", tuple(Point("a", x, y, 0) for x, y in places), less, more_x)
+
+
+@pytest.mark.parametrize(
+    ("xs", "scale", "limits"),
+    [
+        ((1.0, 8.1), "log", (0.6, 1.7 * 8.1)),
+        ((0.0, 1.0, 9.0), "log", (0.6, 15.3)),
+        ((1.0, 7.9), "linear", (0.0, 1.15 * 7.9)),
+    ],
+)
+def test_costs_of_a_wide_range_are_drawn_on_a_logarithmic_axis(
+    xs: tuple[float, ...], scale: str, limits: tuple[float, float]
+) -> None:
+    axes: Any = Figure().add_subplot()
+    draw_panel(axes, points_at(*((x, 2.0 * x) for x in xs)), LIGHT)
+    assert (axes.get_xscale(), axes.get_yscale()) == (scale, "linear")
+    assert axes.get_xlim() == pytest.approx(limits) and axes.yaxis_inverted()
+    by_psnr: Any = Figure().add_subplot()
+    draw_panel(by_psnr, points_at((1.0, 3.0), (2.0, 4.0), more_x=True, less=False), LIGHT)
+    assert (by_psnr.get_xscale(), by_psnr.get_yscale()) == ("linear", "log")
+    assert not by_psnr.yaxis_inverted()
+
+
+@pytest.mark.parametrize(
+    ("less", "more_x", "front"),
+    [
+        (True, False, [(1.0, 5.0), (2.0, 3.0)]),
+        (False, False, [(1.0, 5.0), (4.0, 9.0)]),
+        (True, True, [(4.0, 9.0), (3.0, 4.0), (2.0, 3.0)]),
+        (False, True, [(4.0, 9.0)]),
+    ],
+)
+def test_the_border_of_what_is_beaten_goes_from_the_worst_to_the_end_of_the_panel(
+    less: bool, more_x: bool, front: list[tuple[float, float]]
+) -> None:
+    panel = points_at((1.0, 5.0), (2.0, 3.0), (3.0, 4.0), (4.0, 9.0), less=less, more_x=more_x)
+    axes: Any = Figure().add_subplot()
+    draw_panel(axes, panel, LIGHT)
+    (left, right), worst = axes.get_xlim(), axes.get_ylim()[0]
+    found = axes.lines[-1].get_xydata().tolist()
+    end = (left if more_x else right, front[-1][1])
+    expected = [(front[0][0], worst), *front, end]
+    assert [tuple(each) for each in found] == pytest.approx(expected)
+
+
+def test_curves_have_room_for_the_longest_run_and_bars_as_long_as_learning_took() -> None:
+    runs = [run("A", train_seconds=30.0, learn_seconds=4.0), run("B", train_seconds=50.0)]
+    runs += [run("C", train_seconds=20.0, learn_seconds=None), run("B", 1, train_seconds=10.0)]
+    lines, axes = lines_of(results(*runs)), Figure().add_subplot()
+    draw_curves(axes, lines, LIGHT)
+    assert axes.get_xlim() == pytest.approx((0.0, 51.0))
+    low, high = axes.get_ylim()
+    _draw_learning(axes, lines, LIGHT)
+    share = BAR * (2 + 2.2)  # of the panel's height, below the curves
+    assert axes.get_ylim()[1] == high
+    assert (low - axes.get_ylim()[0]) / (high - axes.get_ylim()[0]) == pytest.approx(share)
+    ends = [segment.tolist() for segment in axes.collections[-1].get_segments()]
+    of_a, of_b = BAR * 1.8, BAR * 0.8
+    assert np.array(ends) == pytest.approx(
+        np.array([[[0.0, of_a], [4.0, of_a]], [[0.0, of_b], [3.0, of_b]]])
+    )
 
 
 @pytest.mark.parametrize("x", [0.4, 0.48, 0.6])

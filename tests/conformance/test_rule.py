@@ -117,6 +117,10 @@ def test_a_card_draws_the_same_numbers_whatever_a_case_has_seeded():
 def test_shifts_of_neighbours_are_neither_alike_nor_opposite():
     generator = torch.Generator().manual_seed(0)
     _check_uniform(torch.rand(20_000, generator=generator))
+    even = torch.linspace(0.0, 1.0, 10_000)[torch.randperm(10_000, generator=generator)]
+    _check_uniform(0.039 + (1.0 - 0.039) * even)  # of 10,000 they may be 4 / 100 away
+    with pytest.raises(Broken, match="away from uniform"):
+        _check_uniform(0.041 + (1.0 - 0.041) * even)
     shares = torch.rand(10_000, generator=generator)
     for other in (shares, 1.0 - shares):
         with pytest.raises(Broken, match="correlate by"):

@@ -143,6 +143,9 @@ def test_a_slider_that_nobody_has_moved_follows_the_run() -> None:
     assert view.chosen() is None
     view.follow(0.3)
     assert view.keep_from.value == 0.3
+    for value, chosen in ((0.3009, None), (0.2991, None), (0.3011, 0.3011), (0.2989, 0.2989)):
+        view.keep_from.value = value
+        assert view.chosen() == chosen
     view.keep_from.value = 0.8
     view.follow(0.2)
     assert (view.calibrated.value, view.chosen()) == ("0.2", 0.8)
