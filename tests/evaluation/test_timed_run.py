@@ -423,7 +423,8 @@ def test_a_seed_decides_all_random_numbers(seed: int, monkeypatch: pytest.Monkey
     def draw() -> None:
         drawn.extend((random.random(), np.random.rand(), float(torch.rand(()))))  # noqa: NPY002
 
-    monkeypatch.setattr(module, "warm_up", lambda device: None)
+    warm: list[str] = []
+    monkeypatch.setattr(module, "warm_up", warm.append)
 
     class Config(SimpleNamespace):
         def setup(self, **_: Any) -> Any:
@@ -437,7 +438,7 @@ def test_a_seed_decides_all_random_numbers(seed: int, monkeypatch: pytest.Monkey
         set_timestamp=lambda: None,
     )
     made = set_up(config, Budget(1.0), seed)
-    assert (made.config.machine.seed, config.machine.seed) == (seed, 42)
+    assert (made.config.machine.seed, config.machine.seed) == (seed, 42) and warm == ["cpu"]
     generator = torch.Generator().manual_seed(seed)
     expected = [random.Random(seed).random(), np.random.RandomState(seed).rand()]
     assert drawn == [*expected, float(torch.rand((), generator=generator))]

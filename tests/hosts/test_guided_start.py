@@ -23,6 +23,8 @@ from leco_plugin.host_configs import leco_ngp
 from leco_plugin.hosts import guided_start
 from leco_plugin.hosts.guide import Guide
 from leco_plugin.hosts.guided_start import (
+    PLACES,
+    AlongRays,
     GuidedStart,
     OccupancyConfig,
     along_rays,
@@ -364,3 +366,25 @@ def test_of_an_unbounded_scene_rays_are_looked_at_far_beyond_its_inner_cube(
     found = along_rays(Guide(), occupancy, camera)
     torch.testing.assert_close(found.lengths, torch.full_like(found.lengths, 0.5 * reach))
     assert found.share_kept(0.0) == pytest.approx(1.0)
+
+
+def test_an_occupancy_is_asked_evenly_between_where_a_ray_enters_and_leaves_its_box(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    gate, eye = Gate(GateConfig(EncodingConfig(octaves=1), 8, 1, 2)), torch.eye(3, 4)[None]
+    eye[:, :, 3] = torch.tensor([0.2, 0.1, 3.0])
+    occupancy = Occupancy(gate, Space("box", (0.2, 0.0, 1.0), 0.5), 0.0).eval()
+    monkeypatch.setattr(occupancy, "query", lambda places: places[:, 2])
+    found = along_rays(Guide(), occupancy, Cameras(eye, 1000.0, 1000.0, 1.0, 1.0, 2, 2))
+    expected = 1.5 - (torch.arange(PLACES) + 0.5) / PLACES
+    torch.testing.assert_close(found.values, expected.expand_as(found.values), atol=1e-3, rtol=0.0)
+    torch.testing.assert_close(found.lengths, torch.ones(len(found.lengths)), atol=1e-3, rtol=0.0)
+    behind = Occupancy(gate, Space("box", (0.2, 0.0, 5.0), 0.5), 0.0).eval()
+    assert len(along_rays(Guide(), behind, Cameras(eye, 9.0, 9.0, 1.0, 1.0, 2, 2)).lengths) == 0
+
+
+def test_what_is_kept_of_rays_counts_by_their_lengths() -> None:
+    along = AlongRays(torch.tensor([[0.1, 0.6], [0.5, 0.5], [0.2, 0.4]]), torch.tensor([2.0, 6, 4]))
+    assert along.kept(0.5).tolist() == [1.0, 6.0, 0.0]
+    assert along.share_kept(0.5) == pytest.approx(7.0 / 12.0)
+    assert along.share_kept(0.2) == pytest.approx(11.0 / 12.0)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from scene_files import refused
 
-from leco_plugin.scenes.lenses import UNDISTORTED, check_together, lens_of, set_lenses
+from leco_plugin.scenes.lenses import UNDISTORTED, bend, check_together, lens_of, set_lenses
 from leco_plugin.scenes.scene_file import unused_fields
 
 SCENE: dict[str, Any] = {
@@ -162,3 +164,26 @@ def test_fisheyes_show_one_circle() -> None:
     for each in ((9, 8), (9, None)):
         with refused(r"here gives its fisheyes .*masks"):
             check_together(radii(*each), "here")
+
+
+def test_a_lens_bends_as_opencv_says() -> None:
+    slopes = torch.rand(50, 2, generator=torch.Generator().manual_seed(0)) * 1.2 - 0.6
+    k1, k2, k3, p1, p2 = 0.1, -0.05, 0.02, 0.03, -0.02
+    places = np.pad(slopes.double().numpy(), ((0, 0), (0, 1)), constant_values=1.0)
+    still = np.zeros(3)
+    expected, _ = cv2.projectPoints(places, still, still, np.eye(3), np.array([k1, k2, p1, p2, k3]))
+    found, shown = bend(slopes, [k1, k2, k3, 0.0, p1, p2])
+    np.testing.assert_allclose(found.numpy(), expected[:, 0], rtol=1e-5)
+    assert bool(shown.all())
+    r = slopes.square().sum(dim=-1, keepdim=True)
+    torch.testing.assert_close(bend(slopes, [0, 0, 0, 0.3, 0, 0])[0], slopes * (1.0 + 0.3 * r**4))
+    assert torch.equal(bend(slopes, None)[0], slopes)
+
+
+def test_a_lens_shows_nothing_beyond_where_it_folds_and_bends_nothing_far_outside() -> None:
+    """With k1 -0.1 radii no longer grow where 3 x 0.1 r^2 is 1."""
+    slopes = torch.tensor([3.3, 3.36, 3.9, 4.1]).sqrt()[:, None] * torch.tensor([[0.6, -0.8]])
+    bent, shown = bend(slopes, [-0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert shown.tolist() == [True, False, False, False]
+    left = torch.tensor([[0.67], [0.664], [0.61], [1.0]])
+    torch.testing.assert_close(bent, left * slopes)
