@@ -123,3 +123,40 @@ def test_the_mask_is_named(name: str, tmp_path: Path) -> None:
 def test_a_missing_mask_is_named_and_not_its_photograph(tmp_path: Path) -> None:
     with refused(r"the mask .*masks_2/c\.png is not there"):
         read(tmp_path / "masks_2" / "c.png")
+
+
+@pytest.mark.parametrize(
+    ("size", "fits"),
+    [((72, 48), True), ((74, 47), True), ((69, 51), True), ((76, 48), False), ((72, 52), False)],
+)
+def test_a_mask_of_a_whole_number_of_times_the_size_may_be_rounded(
+    size: tuple[int, int], fits: bool, tmp_path: Path
+) -> None:
+    """By a pixel of the photograph: three of the mask."""
+    WHITE.resize(size, Image.Resampling.NEAREST).save(tmp_path / "a.png")
+    if fits:
+        assert read(tmp_path / "a.png").shape == (16, 24)
+    else:
+        with refused("save it as large as its image, or a whole number"):
+            read(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize(("lightest", "seen"), [(128, [0, 0, 1, 1]), (127, [0, 1, 1, 1])])
+def test_greys_from_the_middle_on_are_seen_where_there_are_so_light_ones(
+    lightest: int, seen: list[int], tmp_path: Path
+) -> None:
+    greys = np.array([[0, 60, lightest, 128 if lightest == 128 else 127]], np.uint8)
+    Image.fromarray(greys).save(tmp_path / "a.png")
+    assert read(tmp_path / "a.png", (4, 1)).tolist() == [[bool(each) for each in seen]]
+
+
+@pytest.mark.parametrize(("difference", "is_grey"), [(40, True), (41, False)])
+def test_a_little_colour_is_left_by_jpeg(difference: int, is_grey: bool, tmp_path: Path) -> None:
+    pixels = np.full((2, 3, 3), 200, np.uint8)
+    pixels[1, 2, 1] -= difference
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    if is_grey:
+        assert read(tmp_path / "a.png", (3, 2)).all()
+    else:
+        with refused("has colours"):
+            read(tmp_path / "a.png", (3, 2))

@@ -106,9 +106,30 @@ def test_one_view_is_too_few(small: City) -> None:
         views_of(small, CaptureConfig(aerial_per_block=0.3, street_per_block=0))
 
 
+def test_pictures_have_the_opening_angle_across() -> None:
+    lens = CaptureConfig(width=40, height=30, field_of_view=90.0).lens
+    assert (lens.width, lens.height) == (40, 30) and lens.focal == pytest.approx(20.0)
+
+
+@pytest.mark.parametrize(
+    "ends",
+    [
+        {"width": 8, "height": 8192, "field_of_view": 10.0, "test_every": 2},
+        {"width": 8192, "height": 8, "field_of_view": 120.0},
+        {"aerial_per_block": 1000.0, "street_per_block": 0.0},
+        {"aerial_per_block": 0.0, "street_per_block": 1000.0},
+    ],
+)
+def test_pictures_at_the_limits_can_be_taken(ends: dict) -> None:
+    assert CaptureConfig(**ends)
+
+
 @pytest.mark.parametrize(
     "bad",
     [
+        *({"width": 7}, {"height": 7}, {"width": 8193}, {"height": 8193}),
+        *({"field_of_view": 9.9}, {"field_of_view": 120.1}),
+        *({"aerial_per_block": 1000.1}, {"street_per_block": 1000.1}, {"street_per_block": -0.1}),
         {"width": 0},
         {"field_of_view": 180.0},
         {"aerial_per_block": -1.0},

@@ -135,6 +135,21 @@ def test_terrain_lies_around_the_city_and_below_its_ground() -> None:
     assert city.occupied(np.array([[0.0, 0.0, -6.0]])).all()
 
 
+def test_a_place_is_on_a_block_where_its_cell_is_built(city: City) -> None:
+    assert not np.array_equal(city.built, city.built.T)  # else axes could be swapped
+    for i, j in np.ndindex(*city.built.shape):
+        corners = np.array([[-19.9, -19.9], [19.9, -19.9], [-19.9, 19.9], [19.9, 19.9]])
+        assert (city.on_block(city.centres[i, j] + corners) == city.built[i, j]).all()
+    assert not city.on_block(np.array([[60.1, 0.0], [-60.1, 0.0], [0.0, 60.1], [0.0, -60.1]])).any()
+
+
+def test_a_city_at_the_limits_can_be_asked_for() -> None:
+    assert CityConfig(blocks=1, block_size=32.0) and CityConfig(blocks=64, block_size=200.0)
+    for size in (31.9, 200.1):
+        with pytest.raises(ValueError, match="32 to 200 metres"):
+            CityConfig(block_size=size)
+
+
 @pytest.mark.parametrize(
     "bad", [{"blocks": 0}, {"blocks": 65}, {"seed": -1}, {"block_size": 5.0}, {"block_size": 1e9}]
 )
