@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -11,7 +13,7 @@ from ball_occupancy import CENTRE, HALF, RADIUS, ball
 
 from leco_plugin.capacity import search as searching
 from leco_plugin.capacity.choice import NAMES
-from leco_plugin.capacity.evidence import Evidence
+from leco_plugin.capacity.evidence import Evidence, Loss
 from leco_plugin.capacity.references import (
     Bounds,
     Ground,
@@ -199,7 +201,49 @@ def test_places_anywhere_are_taught_too() -> None:
     assert len(lesson.mapped) == 20_000 + (1 << 14)
     inside = in_parts(known.query, known.space.unmap(lesson.mapped)) >= known.threshold
     assert float((inside == (lesson.keep > 0)).float().mean()) > 0.999
+    known_worths = known_worth(known, 0)
+    times = 1.0 + 8.0 * (known_worths.weights / 0.05).clamp(max=1.0)
+    torch.testing.assert_close(lesson.keep[:20_000], known_worths.kept * times)
+    assert set(lesson.keep[20_000:].tolist()) == {0.0, 1.0}
+    torch.testing.assert_close(lesson.skip, (lesson.keep == 0.0).float())
     assert float(lesson.keep.max()) > 1.5 and whole_box(known).low.tolist() == [-1.0, 0.0, -1.5]
+
+
+@pytest.mark.parametrize(
+    ("share", "bound", "before", "price", "kept", "verdict"),
+    [
+        (5e-4, 1e-3, 0.0, 0.05, 1.0, "chosen"),
+        (5.01e-4, 9e-4, 0.0, None, 1.0, "loses too much"),
+        (5.9e-4, 9e-4, 2e-4, None, 1.0, "chosen"),  # half of what was lost before is added
+        (6.1e-4, 9e-4, 2e-4, None, 1.0, "loses too much"),
+        (1e-4, 1.01e-3, 0.0, None, 1.0, "loses too much"),
+        (1e-4, 2e-4, 0.0, 0.051, 1.0, "costs too much of the image"),
+        (1e-4, 2e-4, 0.0, None, 0.95, "chosen"),
+        (1e-4, 2e-4, 0.0, None, 0.94, "keeps too much"),
+    ],
+)
+def test_a_gate_is_within_half_of_the_bound_at_about_the_volume_of_the_original(
+    share: float,
+    bound: float,
+    before: float,
+    price: float | None,
+    kept: float,
+    verdict: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It has one score everywhere, and keeps all of the volume of which the original keeps some."""
+    found, looks = Loss(share, bound, 0.0), []
+    monkeypatch.setattr(searching, "_losses_of", lambda *_: lambda threshold, look: [found])
+    monkeypatch.setattr(searching, "verify", lambda *given: looks.append(given[-1]) or True)
+    gate = Occupancy(ball().gate, ball().space, 0.1).eval()
+    monkeypatch.setattr(gate, "query", lambda places: torch.full((len(places),), 0.25))
+    known: Any = SimpleNamespace(
+        references=[SimpleNamespace(lost_before=before)], price=lambda *_: price
+    )
+    rung, placed = searching._measure(known, gate, Bounds(1e-3), torch.zeros(50, 3), kept, 3)
+    assert (rung.verdict, rung.lost_surface_mass) == (verdict, share)
+    assert placed.threshold == 0.25 and rung.kept_volume == pytest.approx(1.0 / kept, abs=1e-4)
+    assert rung.bytes == 2 * rung.params and looks == [3] * (verdict == "chosen")
 
 
 def test_a_gate_that_nearly_holds_is_taught_for_longer(monkeypatch: pytest.MonkeyPatch) -> None:
