@@ -16,7 +16,7 @@ from torch import Tensor
 from leco_plugin.scenes import data_manager
 from leco_plugin.scenes.city.cameras import look_at
 from leco_plugin.scenes.data_manager import LecoDataManagerConfig, upright_outputs
-from leco_plugin.scenes.frames import _vertical_of, turn_to_upright
+from leco_plugin.scenes.frames import _fly_over, _normal_of_layer, _vertical_of, turn_to_upright
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 from leco_plugin.scenes.survey import survey
 
@@ -88,7 +88,7 @@ def test_without_points_cameras_of_several_headings_show_what_is_up() -> None:
     assert found is not None and float((found @ SIDEWAYS @ UP)[2]) > np.cos(np.deg2rad(3))
 
 
-@pytest.mark.parametrize(("roll", "known"), [(5.0, True), (20.0, False)])
+@pytest.mark.parametrize(("roll", "known"), [(5.0, True), (8.5, True), (8.8, False), (20.0, False)])
 def test_right_axes_show_the_vertical_where_they_are_level(roll: float, known: bool) -> None:
     """Of cameras that turn, and lean to the left and to the right in turns."""
     lean = torch.deg2rad(torch.tensor([roll, -roll])).repeat(12)
@@ -97,6 +97,22 @@ def test_right_axes_show_the_vertical_where_they_are_level(roll: float, known: b
     found = _vertical_of(torch.nn.functional.normalize(along, dim=-1).double())
     assert (found is not None) == known
     assert found is None or float(found[2].abs()) > 0.99
+
+
+@pytest.mark.parametrize(("turned", "known"), [(17.2, False), (17.7, True)])
+def test_right_axes_show_the_vertical_where_they_turn(turned: float, known: bool) -> None:
+    """By a sine of 0.3 to either side."""
+    angles = torch.deg2rad(torch.tensor([turned, -turned])).repeat(12)
+    rights = torch.stack([angles.cos(), angles.sin(), torch.zeros(24)], dim=-1).double()
+    assert (_vertical_of(rights) is not None) == known
+
+
+@pytest.mark.parametrize(("thickness", "flat"), [(0.34, True), (0.36, False)])
+def test_a_layer_is_thin_beside_its_lesser_width(thickness: float, flat: bool) -> None:
+    corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3).double()
+    normal = _normal_of_layer(corners * torch.tensor([2.0, thickness, 1.0]))
+    assert (normal is not None) == flat
+    assert normal is None or normal.abs().tolist() == pytest.approx([0.0, 1.0, 0.0])
 
 
 def test_without_points_cameras_that_are_held_alike_may_stand_before_a_wall() -> None:
@@ -108,6 +124,30 @@ def test_a_survey_that_is_upright_stays_as_it_is() -> None:
         assert turn_to_upright(flight(tilt, headings), ground()) is None
     slope = torch.tensor([[0.94, 0.0, 0.34], [0.0, 1.0, 0.0], [-0.34, 0.0, 0.94]])
     assert turn_to_upright(flight(0, 2), ground() @ slope.T) is None
+
+
+@pytest.mark.parametrize(
+    ("axis", "share", "wide"), [(0, 0.33, True), (0, 0.27, False), (1, 0.27, False)]
+)
+def test_cameras_that_are_held_alike_fly_where_they_spread_over_their_height(
+    axis: int, share: float, wide: bool
+) -> None:
+    """By three tenths of it, in the direction in which they spread less."""
+    poses, points = flight(3, 1).double(), ground().double()
+    places = poses[:, :, 3]
+    clearance = float(places[:, 2].median() - points[:, 2].median())
+    places[:, axis] *= share * clearance / float(places[:, axis].std())
+    assert _fly_over(poses, points, UP.double()) is wide
+
+
+@pytest.mark.parametrize(("below", "above"), [(6, True), (7, False)])
+def test_three_quarters_of_the_cameras_of_a_flight_are_above_nearly_all_points(
+    below: int, above: bool
+) -> None:
+    poses, points = flight(3, 4).double(), ground().double()
+    poses[:below, 2, 3] = points[:, 2].quantile(0.94)
+    poses[below:, 2, 3] = points[:, 2].quantile(0.96)
+    assert _fly_over(poses, points, UP.double()) is above
 
 
 def test_photographs_of_other_things_stay_as_they_are() -> None:

@@ -119,6 +119,18 @@ def test_gps_that_contradicts_the_order_does_not_decide_alone() -> None:
     assert unordered.reason == f"{NEIGHBOURS} nearest by GPS", "no order tells anything"
 
 
+def test_two_next_to_one_another_in_order_are_compared_however_far_apart_they_are() -> None:
+    """Three places a kilometre apart; who goes from one to the next stood amid the others."""
+    places = 50.0 * np.random.default_rng(0).normal(size=(300, 3))
+    places[[97, 98, 99, 100, 101, 102]] *= 0.01
+    places[100:200, 0] += 1000.0
+    places[200:, 0] += 2000.0
+    found = choose_pairs(names(300), [Exif()] * 300, places)
+    assert found.reason == f"{NEIGHBOURS} nearest by GPS"
+    between = {pair for pair in found.pairs if {*pair} <= {*range(97, 103)} and pair[0] < 100}
+    assert {pair for pair in between if pair[1] >= 100} == {(98, 100), (99, 100), (99, 101)}
+
+
 def test_one_wrong_position_does_not_make_a_small_place_wide() -> None:
     places = 2.0 * np.random.default_rng(0).normal(size=(60, 3))
     places[7, :2] = 5000.0
