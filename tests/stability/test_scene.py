@@ -113,6 +113,33 @@ def test_the_nearest_surface_is_seen_and_the_rest_is_transparent() -> None:
     assert nothing.tolist() == [[0.0] * 4] and np.isinf(depths).all()
 
 
+@pytest.mark.parametrize(
+    ("origin", "direction", "towards"),
+    [
+        ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 0.0),
+        ((9.0, 0.0, 0.0), (-1.0, 0.0, 0.0), 0.48),
+        ((2.5, 0.0, 9.0), (0.0, 0.0, -1.0), 0.8),
+        ((2.5, -9.0, 0.0), (0.0, 1.0, 0.0), 0.36),
+        ((2.5, 9.0, 0.0), (0.0, -1.0, 0.0), 0.0),
+    ],
+)
+def test_sides_are_lit_as_far_as_they_face_the_sun(
+    origin: tuple[float, ...], direction: tuple[float, ...], towards: float
+) -> None:
+    colours, depths, _ = look(Stage((WALL,)), np.array([origin]), np.array([direction]))
+    assert np.isfinite(depths).all()
+    assert colours[0, :3] == pytest.approx(0.6 * (0.45 + 0.55 * towards))
+
+
+def test_the_sky_is_behind_what_is_there() -> None:
+    up = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [0.0, 0.6, 0.8], [1.0, 0.0, 0.0]])
+    colours, depths, _ = look(Stage((WALL,), sky=True), np.zeros((4, 3)), up)
+    zenith, horizon = np.array([0.35, 0.55, 0.86]), np.array([0.86, 0.90, 0.94])
+    between = horizon + 0.8**0.6 * (zenith - horizon)
+    np.testing.assert_allclose(colours[:3, :3], [zenith, horizon, between])
+    assert (colours[:, 3] == 1.0).all() and np.isinf(depths[:3]).all() and depths[3] == 2.0
+
+
 def test_fog_takes_what_the_law_of_beer_and_lambert_says() -> None:
     air = Box((-9.0, -9.0, -9.0), (9.0, 9.0, 9.0), Paint((1.0, 0.0, 0.0), contrast=0.0))
     clear, foggy = seen(Stage((WALL,))), seen(Stage((WALL,), fog=Fog(air, 0.4)))

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from leco_plugin.scenes.city import render
 from leco_plugin.scenes.city.cameras import Lens, aerial_cameras, look_at, street_cameras
 from leco_plugin.scenes.city.city import City, CityConfig
 from leco_plugin.scenes.city.render import Tracer
@@ -76,6 +77,40 @@ def test_a_place_looks_the_same_from_everywhere(tracer: Tracer) -> None:
     both = seen_a & seen_b
     assert both.sum() > 30
     assert (np.abs(a - b)[both].max(1) < 0.02).mean() > 0.97  # edges of stripes and shadows aside
+
+
+def test_light_is_the_suns_where_it_reaches_and_the_skys(
+    tracer: Tracer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def grey(city: City, places: np.ndarray, *_: object) -> np.ndarray:
+        return np.full(places.shape, 0.5, np.float32)
+
+    monkeypatch.setattr(render, "paint_surface", grey)
+    random = np.random.default_rng(0)
+    origins = np.array([0.0, 0.0, 60.0]) + random.uniform(-30, 30, (300, 3)) * [1, 1, 0]
+    rays = random.normal(0, 0.5, (300, 3)) * [1, 1, 0] - [0, 0, 1]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    faces, depths = tracer.cast(origins, rays)
+    hit = faces >= 0
+    places, normals = (origins + depths[:, None] * rays)[hit], tracer.normals[faces[hit]]
+    towards = normals @ render.SUN
+    starts = places + 1e-3 * normals
+    shadow = tracer.cast(starts, np.broadcast_to(render.SUN, starts.shape))[0] >= 0
+    lit = np.where(shadow, 0.0, towards.clip(min=0.0))[:, None]
+    openness = 0.55 + 0.3 * normals[:, 2:] + 0.15 * (places[:, 2:] / 12).clip(0, 1)
+    light = lit * [1.06, 1.0, 0.9] + openness * [0.42, 0.46, 0.52]
+    found = tracer.colour(origins, rays, 1e-3)[0][hit]
+    np.testing.assert_allclose(found, (0.5 * light).clip(0, 1), atol=1e-5)
+    assert (towards < -0.1).sum() > 9 and (shadow & (towards > 0.1)).sum() > 9 and lit.max() > 0.7
+
+
+def test_the_sky_is_pale_at_the_horizon_and_below() -> None:
+    directions = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.6, -0.8], [0.6, 0.0, 0.8]])
+    zenith, horizon = np.array([0.22, 0.42, 0.72]), np.array([0.74, 0.80, 0.86])
+    between = horizon + 0.8**0.6 * (zenith - horizon)
+    np.testing.assert_allclose(
+        render.sky(directions), [zenith, horizon, horizon, between], rtol=1e-5
+    )
 
 
 def test_all_materials_are_textured(tracer: Tracer) -> None:

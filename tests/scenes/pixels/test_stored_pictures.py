@@ -79,6 +79,9 @@ def test_a_batch_is_of_pixels_that_are_not_held_out_and_not_masked(tmp_path: Pat
     batch = sampler().sample(store_pictures(dataset, tmp_path / "pixels"))
     indices = batch["indices"]
     assert batch["image"].shape == (4000, 3)
+    pictures = [dataset.get_data(number)["image"] for number in range(3)]
+    expected = torch.stack([pictures[i][r, c] for i, r, c in indices.tolist()])
+    torch.testing.assert_close(batch["image"], expected, atol=1e-6, rtol=0)
     widths = torch.tensor(SIZES)[indices[:, 0], 1]
     assert not bool(Lattice().holds_out(indices).any())
     assert bool((indices[:, 2] < widths // 2).all())

@@ -140,6 +140,7 @@ def test_wrong_altitudes_neither_tilt_a_survey_nor_cost_it_its_metres(kind: str)
     assert placed.scale == pytest.approx(25.0, rel=0.03)
     np.testing.assert_allclose(placed.turn @ up, [0.0, 0.0, 1.0], atol=1e-9)
     np.testing.assert_allclose(placed.apply(centres)[:, :2], places[:, :2], atol=3.0)
+    assert np.median(gps[:, 2] - placed.apply(centres)[:, 2]) == pytest.approx(0.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("scatter", [0.0, 1.0])
