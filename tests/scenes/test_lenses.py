@@ -57,6 +57,29 @@ def test_a_lens_without_a_principal_point_has_the_middle_of_its_picture() -> Non
     assert found == [15.0, 15.0, 10.0, 7.5]
 
 
+def test_each_camera_has_its_own_lens_and_all_one_circle() -> None:
+    sides = torch.full((3, 1), 20), torch.full((3, 1), 15)
+    cameras = Cameras(torch.eye(4)[None, :3].repeat(3, 1, 1), *torch.ones(4, 3, 1), *sides)
+    frame = {"camera_model": "OPENCV_FISHEYE", "k2": 0.2, "fisheye_crop_radius": 8}
+    lenses = [None, lens_of(SCENE, frame, "here"), lens_of(SCENE | {"cy": 11}, {}, "here")]
+    set_lenses(cameras, lenses, 2)
+    found = {name: getattr(cameras, name).flatten().tolist() for name in ("fx", "fy", "cx", "cy")}
+    assert found == {
+        "fx": [1, 10, 10],
+        "fy": [1, 10.5, 10.5],
+        "cx": [1, 10, 10],
+        "cy": [1, 7.5, 5.5],
+    }
+    kinds = [CameraType(kind) for kind in cameras.camera_type.flatten().tolist()]
+    assert kinds == [CameraType.PERSPECTIVE, CameraType.FISHEYE, CameraType.PERSPECTIVE]
+    assert cameras.distortion_params is not None
+    bent = torch.tensor([[0, 0, 0, 0, 0, 0], [0, 0.2, 0, 0, 0, 0], [0.1, 0, 0, 0, 0, 0]])
+    torch.testing.assert_close(cameras.distortion_params, bent)
+    assert cameras.metadata == {"fisheye_crop_radius": 8.0}
+    set_lenses(cameras, [None, None, None], 2)
+    assert cameras.metadata == {}
+
+
 def test_a_fisheye_of_instant_ngp_is_one() -> None:
     assert lens_of({"is_fisheye": True}, {}, "here").kind is CameraType.FISHEYE
     assert lens_of({}, {"is_fisheye": True}, "here").kind is CameraType.FISHEYE
