@@ -132,3 +132,8 @@ def test_damaged_exif_says_nothing() -> None:
     Image.new("L", (8, 8)).save(file, "JPEG", exif=b"Exif\0\0MM\0*\0\0\0\x08\xff\xff" + 9 * b"\xfe")
     with pytest.warns(UserWarning, match="Corrupt EXIF"), Image.open(file) as image:
         assert read_exif(image).position is None
+
+
+def test_on_the_equator_or_the_meridian_of_greenwich_a_position_is_one() -> None:
+    assert _position({2: (51.0, 30.0, 0.0), 4: (0.0, 0.0, 0.0)}) is not None
+    assert _position({2: (0.0, 0.0, 0.0), 4: (109.0, 15.0, 0.0)}) is not None
