@@ -104,7 +104,7 @@ def test_lines_of_a_film_end_at_its_look(run: Path) -> None:
             assert [line.get_ydata()[-1] for line in axes.lines] == pytest.approx(ends)
             assert axes.get_xlim() == (0.0, 20.0)
     box = history_picture.interesting_box(ball(), history_picture.cameras_of(ball()))
-    low, high = history_picture.heights_seen_from_above(ball(), box)
+    low, high = history_picture.heights_seen_from_above(history_picture.kept_cells(ball(), box))
     (above, height), (beside, y) = film.places
     assert (above, beside) == (2, 1) and height == pytest.approx(low + 0.12 * (high - low))
     assert y == pytest.approx(2.0, abs=0.1)  # the ball's middle
