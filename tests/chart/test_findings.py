@@ -349,6 +349,17 @@ def test_two_are_level_only_where_the_seeds_leave_little_room(close, word) -> No
     assert compare(small, wide, close=None).word == OPEN
 
 
+def test_a_margin_is_narrow_beside_the_mean_of_all_runs_not_of_one_side() -> None:
+    """The margin is 2.54. A quarter of the mean of all is 2.67 and then 2.49; that of one side lies
+    on the other side of the margin, and so does that of both sides' means."""
+    low, high = (8.0, 10.0, 10.0, 12.0), (11.6, 12.4)
+    for scale in (1.0, 50.0):
+        for less, word in ((0.0, "level"), (0.7, OPEN)):
+            ours, theirs = ([scale * (x - less) for x in side] for side in (low, high))
+            assert compare(ours, theirs, close=None).word == word
+            assert compare(theirs, ours, close=None).word == word
+
+
 def test_nothing_cannot_be_compared() -> None:
     with pytest.raises(ValueError, match="0 runs cannot be compared with 1"):
         compare([], [20.0])

@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -18,11 +19,25 @@ from leco_plugin.chart.runner import (
     ProcessRunner,
     RunFailed,
     RunFolder,
+    make_jobs,
 )
 from leco_plugin.scenes.input_error import InputError
 
 SETTINGS = {"seconds": 10.0, "machine": {"cores": 2, "device": "cpu"}, "sizes": (1, 2)}
 JOB = Job(Contender("A + b", "a", "b", {"x.y": 1}), 3)
+
+
+@pytest.mark.parametrize("done", [0, 6])
+def test_the_share_that_is_done_is_of_all_jobs_those_of_before_included(done: int) -> None:
+    shares: list[float] = []
+
+    def make_one(job: str, show: Callable[[float], None]) -> str:
+        show(0.5)
+        return job
+
+    make_jobs("ab", make_one, lambda line: None, shares.append, done=done)
+    steps = [0.0, 0.5, 1.0, 1.0, 1.5, 2.0]
+    assert shares == pytest.approx([(done + step) / (done + 2) for step in steps])
 
 
 def test_a_stored_run_is_found_again_under_its_job(tmp_path: Path) -> None:
