@@ -289,14 +289,15 @@ def test_another_scene_gives_no_colours_and_no_start_for_splats(
     assert not export(file, "ply", tmp_path / "k.ply", 16)["photograph_colours"]
 
 
-@pytest.mark.parametrize(("left", "is_known"), [(2, True), (1, False)])
+@pytest.mark.parametrize(("named", "left", "is_known"), [(3, 2, True), (3, 1, False), (2, 1, True)])
 def test_a_scene_with_half_of_the_cameras_is_that_of_the_run(
-    left: int, is_known: bool, file: Path, scene: Path
+    named: int, left: int, is_known: bool, file: Path, scene: Path
 ) -> None:
-    frames = described(scene)["frames"]
+    frames, occupancy = described(scene)["frames"], Occupancy.load(file)
+    occupancy.report["cameras"] = occupancy.report["cameras"][:named]
     change(scene, lambda meta: meta.update(frames=frames[:left]))
     with nullcontext() if is_known else refused("1 of the 3 cameras that the occupancy names"):
-        assert inspection.scene_of(Occupancy.load(file), file, scene) is not None
+        assert inspection.scene_of(occupancy, file, scene) is not None
 
 
 def test_a_copy_says_what_its_scene_leaves_to_a_folder_beside_it(
