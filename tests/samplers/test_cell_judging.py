@@ -181,6 +181,22 @@ def test_planes_are_weighted_least_squares_and_doubts_their_largest_residual(bal
         assert float(doubts[cell]) == pytest.approx(float(residuals.max()), rel=1e-2, abs=1e-2)
 
 
+def test_a_plane_never_decides_in_a_cell_in_which_space_ends(balls):
+    """There o is 0 at some of its points, and as it is beside them at the others."""
+    coarse, corners = judge_coarse(balls, N, LEAST_MARGIN)
+    cells = (coarse == MIXED).nonzero()[:3]
+    _, values, places = judge_fine(balls, corners, cells, LEAST_MARGIN)
+    size = 2.0 / (BRICK * N)
+    planes, doubts = fit_planes(balls, values, places, size)
+    assert planes.any(dim=1).all() and (doubts > 0.0).all()
+    lowest, threshold = (torch.tensor(o).logit(eps=1e-7) for o in (0.0, balls.threshold))
+    values[0, 3] = values[1, :8] = lowest - threshold
+    values[2, 3] = lowest - threshold + 0.1
+    planes, doubts = fit_planes(balls, values, places, size)
+    assert planes.any(dim=1)[:3].tolist() == [False, False, True]
+    assert (doubts > 0.0)[:3].tolist() == [False, False, True]
+
+
 def test_clearance_is_the_distance_to_what_is_not_empty_or_not_in_the_cube():
     torch.manual_seed(0)
     n = 5
