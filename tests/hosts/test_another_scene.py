@@ -115,6 +115,23 @@ def test_photographs_that_were_added_or_taken_away_are_no_other_scene(
     assert ANOTHER not in " ".join(capsys.readouterr().out.split())
 
 
+@pytest.mark.parametrize(("found", "named", "here"), [(1, 10, 40), (1, 40, 7), (2, 30, 17)])
+def test_a_tenth_of_the_fewer_cameras_is_enough(
+    found: int, named: int, here: int, data: Data, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whether the file names fewer cameras or the run has fewer; one less is warned of."""
+    places = data.train_dataset.cameras.camera_to_worlds[:1].repeat(here, 1, 1)
+    places[:, 0, 3] += torch.arange(here)
+    run = SimpleNamespace(
+        train_dataset=SimpleNamespace(cameras=SimpleNamespace(camera_to_worlds=places))
+    )
+    for same, is_warned in ((found, False), (found - 1, True)):
+        cameras = places[:same, :, 3].tolist() + (named - same) * [[0.0, 90.0, 0.0]]
+        occupancy = learned_by(data, cameras=cameras)
+        refuse_another_scene(occupancy, run, torch.eye(3, 4), insists=True)
+        assert (ANOTHER in " ".join(capsys.readouterr().out.split())) == is_warned
+
+
 def test_another_split_is_no_other_scene(data: Data, capsys: pytest.CaptureFixture[str]) -> None:
     """It was learned on what is tested on here."""
     data = copy.copy(data)

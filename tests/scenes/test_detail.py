@@ -100,6 +100,18 @@ def test_of_distances_the_nearest_counts() -> None:
     assert found.texels == pytest.approx(detail_of(near, ground(6.0)).texels, rel=0.2)
 
 
+def test_a_few_close_views_add_nothing_and_far_ones_show_less_where_there_are_no_others() -> None:
+    usual, poses = detail_of(survey(6.0), ground(6.0)).texels, survey(6.0).camera_to_worlds
+    close, afar = poses.clone(), poses.clone()
+    close[::4, 2, 3] = HEIGHT / 4.0
+    close = torch.cat([poses, close[::4]])
+    afar[poses[:, 0, 3] > 1.0, 2, 3] = 2.0 * HEIGHT  # a third of the ground
+    for heights, share in ((close, 1.0), (afar, 0.75)):
+        cameras = Cameras(heights, FOCAL, FOCAL, SIDE / 2, SIDE / 2, SIDE, SIDE)
+        found = detail_of(cameras, ground(6.0)).texels
+        assert found == pytest.approx(share * usual, rel=0.1)
+
+
 def test_there_are_no_more_texels_than_pixels() -> None:
     solid = ground(4.0) * torch.tensor([1.0, 1.0, 100.0])  # surfaces everywhere up to half way
     found = detail_of(survey(1.0), solid)

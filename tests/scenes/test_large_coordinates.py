@@ -354,3 +354,12 @@ def test_coordinates_are_large_beside_the_spread_of_the_cameras(share: float, is
     if found is not None:
         np.testing.assert_allclose(found, away)
         assert _rounding(np.array([-5_200_000.5, 500_000.25, 300.0])) == 0.5
+
+
+@pytest.mark.parametrize("share", [0.9, 1.1])
+def test_where_most_cameras_stand_at_one_place_the_farthest_says_what_is_far(share: float) -> None:
+    """As of a panorama; all at one place say nothing."""
+    around = np.array([[0.0, 0.0, 0.0]] * 5 + [[1.0, 0, 0], [0, -2.0, 0]])
+    away = share * FAR * 2.0 * np.array([0.6, -0.8, 0.0])
+    assert (far_origin(around + away) is not None) == (share > 1.0)
+    assert far_origin(around[:5] + away) is None

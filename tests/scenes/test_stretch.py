@@ -76,6 +76,14 @@ def test_of_a_circle_an_arc_is_held_out_and_the_cameras_at_its_ends_are_left_out
     assert apart(positions, held_out, trained) > BESIDE * spacing
 
 
+def test_what_is_beside_is_measured_by_the_usual_distance_not_by_a_few_wide_gaps() -> None:
+    """A line whose gap ends the stretch: the wide steps at its ends do not make it all beside."""
+    along = np.concatenate([[0.0, 40.0], 60.0 + np.arange(-15, 15), [130.0, 170.0]])
+    positions = np.stack([along, 0.0 * along, 0.0 * along], axis=1)
+    held_out, beside = find_stretch(positions)
+    assert len(beside) == 2 and apart(positions, beside, held_out) == 1.0
+
+
 def test_of_a_cloud_what_is_held_out_hangs_together_and_has_no_neighbour_in_training() -> None:
     positions = np.random.default_rng(0).normal(size=(200, 3))
     held_out, beside = find_stretch(positions)

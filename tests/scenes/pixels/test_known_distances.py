@@ -86,6 +86,19 @@ def test_only_plainly_nearer_neighbours_hide_a_point() -> None:
     assert not bool(hidden(pixels, lengths, HEIGHT, WIDTH)[4:].any())
 
 
+@pytest.mark.parametrize(("height", "width"), [(40, 95), (95, 40), (31, 31)])
+def test_what_hides_a_point_is_nearer_in_its_cell_or_in_one_beside_it(
+    height: int, width: int
+) -> None:
+    generator = torch.Generator().manual_seed(3)
+    places = torch.rand(300, 2, generator=generator) * torch.tensor([height, width])
+    pixels, lengths = places.long(), 1.0 + 9.0 * torch.rand(300, generator=generator)
+    cells = pixels // round((2.0 * height * width / 300) ** 0.5)
+    beside = (cells[:, None] - cells[None]).abs().amax(dim=-1) <= 1
+    nearest = lengths.expand(300, 300).where(beside, torch.inf).amin(dim=1)
+    assert hidden(pixels, lengths, height, width).equal(nearest < 0.9 * lengths)
+
+
 def test_large_clouds_are_thinned_the_same_way_each_time(monkeypatch) -> None:
     from leco_plugin.scenes.pixels import known_distances as module
 
