@@ -177,6 +177,16 @@ def test_runs_are_held_against_the_mean_and_median_of_the_rival_not_against_a_se
     assert found.faster == (3.0, 3.0, 3.0)
 
 
+def test_of_three_rivals_the_middle_ones_times_count_and_the_mean_of_their_psnrs() -> None:
+    ours = of_seeds("learned-occupancy", [24.0], render_seconds_per_image=0.5)
+    theirs = of_seeds("own", [20.0, 19.0, 24.0])
+    for one, end, seconds in zip(theirs, (10.0, 12.0, 20.0), (1.0, 2.0, 9.0), strict=True):
+        curve = [[1.0, 10.0], [end, one["psnr"]]]
+        one |= {"curve": curve, "render_seconds_per_image": seconds}
+    (found,) = rivals(lines_of(results(*ours, *theirs)))
+    assert found.passed == (7.0,) and found.sooner == (12.0 / 7.0,) and found.faster == (4.0,)
+
+
 def test_a_last_step_beyond_the_time_that_was_given_is_nobodys_gain() -> None:
     lines = lines_of(results(*of_seeds("learned-occupancy", [21.0]), *of_seeds("own", [20.0])))
     (found,) = rivals(lines, seconds=9.0)
