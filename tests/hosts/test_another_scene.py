@@ -50,9 +50,9 @@ def learned_by(data: Data, **report: Any) -> Occupancy:
 
 
 def of_other_cameras(data: Data, by: float = 0.05, times: int = 1) -> Occupancy:
-    """The ball, as if learned on cameras that lie elsewhere."""
+    """The ball, as if learned on cameras that lie elsewhere: as many as a file names, at most."""
     places = data.train_dataset.cameras.camera_to_worlds[:, :3, 3] + by
-    return learned_by(data, cameras=times * places.tolist())
+    return learned_by(data, cameras=(times * places.tolist())[:MOST_CAMERAS])
 
 
 def with_points(data: Data, *place: float) -> Data:

@@ -25,7 +25,7 @@ def a_history(gate: Gate, looks: int = 3) -> GateHistory:
         with torch.no_grad():
             gate.head.bias += 1.0
         routes, sigmas = torch.tensor([0, 0, 0, 2]), torch.tensor([0.0, 3.0, 0.0, 5.0])
-        history.look(10 * look, 0.5 * look, gate, routes, sigmas)
+        history.look(10 * look, look / 3, gate, routes, sigmas)
     return history
 
 
@@ -40,7 +40,7 @@ def test_the_gate_of_each_look_comes_back_from_the_file(tmp_path: Path) -> None:
     before = gate.head.bias.detach().clone()
     a_history(gate).save(tmp_path)
     found = GateHistory.load(tmp_path / FILE_NAME, gate)
-    assert found.steps == [0, 10, 20] and found.seconds == [0.0, 0.5, 1.0]
+    assert found.steps == [0, 10, 20] and found.seconds == [0.0, 1 / 3, 2 / 3]
     for look, weights in enumerate(found.weights):
         torch.testing.assert_close(weights["head.bias"], before + 1.0 + look)
     assert weights.keys() == gate.state_dict().keys()
