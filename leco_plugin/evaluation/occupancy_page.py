@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from leco_plugin.chart.theme import LIGHT, write_page_file
 from leco_plugin.evaluation import inspection
 from leco_plugin.evaluation.inspection import SceneColours, ViewBox
 from leco_plugin.evaluation.occupancy_picture import (
+    KeptCells,
     heights_seen_from_above,
     interesting_box,
     kept_cells,
@@ -22,8 +24,8 @@ from leco_plugin.evaluation.occupancy_picture import (
 )
 from leco_plugin.occupancy import Occupancy
 
-CELLS = (128, 96, 72, 48, 32)
-"""Along the longest side of the kept volume: the most with which there are few enough faces."""
+COARSER = (96, 72, 48, 32)
+"""Cells along the longest side of the kept volume, where finer ones have too many faces."""
 MOST_FACES = 60_000
 SEEN_CELLS = 32
 COLOURS = 256
@@ -44,8 +46,9 @@ def write_page(occupancy: Occupancy, path: Path, colours: SceneColours | None = 
 
     cameras = inspection.cameras_of(occupancy)
     box = interesting_box(occupancy, cameras)
-    lowest, highest = heights_seen_from_above(kept_cells(occupancy, box))
-    faces = _kept_faces(occupancy, box, lowest)
+    cells = kept_cells(occupancy, box)
+    lowest, highest = heights_seen_from_above(cells)
+    faces = _kept_faces(occupancy, cells, lowest)
     figure = plotly.Figure()
     if len(faces):
         middles = faces.mean(dim=1)
@@ -95,13 +98,13 @@ def faces_of(inside: Tensor, box: ViewBox, beyond: bool) -> Tensor:
     return torch.lerp(box.low, box.high, torch.cat(found) / counts)
 
 
-def _kept_faces(occupancy: Occupancy, box: ViewBox, lowest: float) -> Tensor:
-    """Faces [F, 4, 3] of kept cells, without what is below the ground at `lowest`, scene units; in
-    cells as small as `MOST_FACES` allows."""
-    for longest in CELLS:
-        cells = kept_cells(occupancy, box, longest)
-        faces = faces_of(cells.kept, box, beyond=True)
-        faces = faces[faces[..., 2].amax(dim=1) > lowest - 2.0 * cells.size]
+def _kept_faces(occupancy: Occupancy, cells: KeptCells, lowest: float) -> Tensor:
+    """Faces [F, 4, 3] of kept cells, without what is below the ground at `lowest`, scene units; of
+    `COARSER` ones where there are more than `MOST_FACES`."""
+    coarser = (kept_cells(occupancy, cells.box, longest) for longest in COARSER)
+    for tried in chain([cells], coarser):
+        faces = faces_of(tried.kept, tried.box, beyond=True)
+        faces = faces[faces[..., 2].amax(dim=1) > lowest - 2.0 * tried.size]
         if len(faces) <= MOST_FACES:
             break
     return faces

@@ -85,14 +85,14 @@ def test_the_bounds_are_the_twelve_edges_of_their_box() -> None:
 def test_faces_are_as_fine_as_their_number_allows_and_begin_below_the_ground(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(occupancy_page, "CELLS", (32, 16))
-    box, ground = whole_box(ball()), 0.5
-    fine = occupancy_page._kept_faces(ball(), box, ground)
+    monkeypatch.setattr(occupancy_page, "COARSER", (16,))
+    finest, ground = kept_cells(ball(), whole_box(ball()), 32), 0.5
+    fine = occupancy_page._kept_faces(ball(), finest, ground)
     tops = fine[..., 2].amax(dim=1)
     assert ground - 2.0 * 4.0 / 32 < float(tops.min()) < ground
     for most, cells in ((len(fine), 32), (len(fine) - 1, 16)):
         monkeypatch.setattr(occupancy_page, "MOST_FACES", most)
-        faces = occupancy_page._kept_faces(ball(), box, ground)
+        faces = occupancy_page._kept_faces(ball(), finest, ground)
         sides = faces.amax(dim=1) - faces.amin(dim=1)
         torch.testing.assert_close(sides.amax(dim=0), torch.full((3,), 4.0 / cells))
 
