@@ -51,18 +51,20 @@ def make_charts(
     """
     if suites and (methods or samplers):
         raise InputError("a suite has methods of its own: give --suite or --methods, not both")
-    names = in_order(suites)
-    if len(names) > 1:
+    names: Sequence[str | None] = in_order(suites) or [None]
+    several = len(names) > 1
+    if several:
         if reuse:
             raise InputError("several suites share their runs by themselves: --reuse is for one")
         _check_shared(out)
-        charts = [_chart_of(data, out / name, name, (), (), seeds, (), asked) for name in names]
+    charts = []
+    for name in names:
+        folder = out / str(name) if several else out
+        charts.append(_chart_of(data, folder, name, methods, samplers, seeds, reuse, asked))
+    if several:
         for chart in charts:
             others = [out / other for other in SUITES if other != chart.suite]
             chart.reuse = [other for other in others if not why_not_shared(other, chart.settings)]
-    else:
-        name = names[0] if names else None
-        charts = [_chart_of(data, out, name, methods, samplers, seeds, reuse, asked)]
     return {chart.folder.path: _make(chart, runner_for) for chart in charts}
 
 
