@@ -47,7 +47,7 @@ TIMED = """PSNR after equal time, and seconds to render a test image. What keepi
 is missing in training with it: a fine one shows here what it costs on two cores, and not how good
 it would be. A method that gained more than 0.3 dB in the last third of the time is still rising.
 One that ended more than 0.3 dB below its own best point fell. The others may gain by more time as
-well: rates fall to a tenth over whatever time is given.
+well: rates fall over whatever time is given.
 """
 
 TIMES = """### How long the suites take

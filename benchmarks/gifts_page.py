@@ -63,9 +63,9 @@ learned-occupancy-without-gifts` charts a learned row without them; a stored one
   and bounds are each method's own; LeCO also renders in C, and has the largest table. What a gate
   gains is seen between rows of one method.
 
-Instant-NGP and Nerfacto begin with nerfstudio's rates, the others with rates of ours. All rates
-fall to a tenth. Sizes are what a step on a CPU can pay. Rates and sizes of rivals were
-[swept](#the-rivals-swept), those of learned rows were not.
+Instant-NGP and Nerfacto begin with nerfstudio's rates, the others with rates of ours. How rates
+fall stands below each chart, alike for all of its rows. Sizes are what a step on a CPU can pay.
+Rates and sizes of rivals were [swept](#the-rivals-swept), those of learned rows were not.
 
 This page is generated: `python benchmarks/reference_pages.py`.
 """

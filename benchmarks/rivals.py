@@ -34,9 +34,8 @@ PROPOSED, SHADED = "host.num_proposal_samples_per_ray", "host.num_nerf_samples_p
 
 
 def _rates(rate: float, *groups: str) -> dict[str, Any]:
-    """Settings of a learning rate, which decays to a tenth as that of each host does."""
-    last = {f"optimizers.{group}.scheduler.lr_final": rate / 10.0 for group in groups}
-    return last | {f"optimizers.{group}.optimizer.lr": rate for group in groups}
+    """Settings of a learning rate, which falls as that of each host does."""
+    return {f"optimizers.{group}.optimizer.lr": rate for group in groups}
 
 
 SWEPT: tuple[tuple[str, str, tuple[tuple[str, dict[str, Any]], ...]], ...] = (

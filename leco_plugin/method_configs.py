@@ -7,7 +7,6 @@ from typing import Literal
 
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
-from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 
@@ -18,6 +17,7 @@ from leco_plugin.scenes.data_manager import LecoDataManagerConfig
 from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 from leco_plugin.scenes.pixels.known_distances import KnownDistancePixelSamplerConfig
 from leco_plugin.studio.commands import render_images_without_ffmpeg, show_one_line_in_ns_commands
+from leco_plugin.studio.cooldown import CooldownSchedulerConfig
 from leco_plugin.studio.processes import DataParallelTrainerConfig
 
 show_one_line_in_ns_commands()
@@ -57,7 +57,7 @@ def trainer(
     steps: int = STEPS,
     mixed_precision: bool = False,
 ) -> DataParallelTrainerConfig:
-    """A method: Adam at these rates, decayed to a tenth over its steps.
+    """A method: Adam at these rates, which fall to zero over the last quarter of a run.
 
     Our own models choose their precision themselves, on CPU and CUDA alike.
     """
@@ -72,10 +72,7 @@ def trainer(
         mixed_precision=mixed_precision,
         pipeline=pipeline,
         optimizers={
-            group: {
-                "optimizer": FusedAdamConfig(lr=rate),
-                "scheduler": ExponentialDecaySchedulerConfig(lr_final=rate / 10.0, max_steps=steps),
-            }
+            group: {"optimizer": FusedAdamConfig(lr=rate), "scheduler": CooldownSchedulerConfig()}
             for group, rate in rates.items()
         },
         viewer=ViewerConfig(num_rays_per_chunk=1 << 12, quit_on_train_completion=True),

@@ -15,6 +15,7 @@ from leco_plugin.method_configs import (
 from leco_plugin.models.sizing.sizes import left_open, sizes_for
 from leco_plugin.scenes.photographs import LecoPhotographs
 from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler
+from leco_plugin.studio.cooldown import CooldownSchedulerConfig
 
 METHODS = {"leco-occupancy": leco_occupancy, "leco-occupancy-paper": leco_occupancy_paper}
 
@@ -53,9 +54,8 @@ def test_a_method_reads_checked_photographs_holds_pixels_back_and_ends_when_it_i
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_rates_of_all_groups_decay_to_a_tenth_by_the_last_step(name: str) -> None:
+def test_rates_of_all_groups_fall_towards_the_end_however_long_a_run_is_made(name: str) -> None:
     config: Any = METHODS[name].config
     assert config.optimizers.keys() == {"gate", "field", "encoding"}
     for group in config.optimizers.values():
-        assert group["scheduler"].lr_final == pytest.approx(group["optimizer"].lr / 10.0)
-        assert group["scheduler"].max_steps == config.max_num_iterations
+        assert group["scheduler"] == CooldownSchedulerConfig(max_steps=0)

@@ -29,6 +29,7 @@ from leco_plugin.chart.runner import (
 from leco_plugin.chart.table import table
 from leco_plugin.chart.theme import DARK, LIGHT
 from leco_plugin.evaluation.report import describe_code, describe_machine, read_object
+from leco_plugin.learning.schedule import HELD
 from leco_plugin.log import counted
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import describe_held_out, describe_scene, megapixels_of
@@ -186,6 +187,7 @@ class Chart:
             "scene": self.scene,
             "held_out": self.held_out,
             "protocol": asdict(self.protocol),
+            "rates_held": HELD,
             "suite": self.suite,
             "question": self.question,
             "made": self._made_of(stored),

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from leco_plugin.evaluation.clock import Budget
 from leco_plugin.hosts.guided_start import OWN_SAMPLER
+from leco_plugin.learning.schedule import HELD
 from leco_plugin.log import counted
 from leco_plugin.names import unknown_name
 from leco_plugin.scenes.input_error import InputError
@@ -237,7 +238,7 @@ def settings_of(
     """What the runs of one chart share; runs with other settings are not comparable."""
     from leco_plugin import __version__
 
-    made_on = {"machine": machine, "version": __version__}
+    made_on = {"machine": machine, "version": __version__, "rates_held": HELD}
     return {"format": 1, "scene": scene, "suite": suite, **asdict(protocol), **made_on}
 
 

@@ -176,8 +176,13 @@ def still_rising(lines: Sequence[Line]) -> list[str]:
     return [line.name for line in lines if rises(line)]
 
 
-def settling(lines: Sequence[Line]) -> str:
-    """The last gain of each line, which lines still rise, and whose grid took the training time."""
+def settling(lines: Sequence[Line], held: float | None = None) -> str:
+    """The last gain of each line, which lines still rise, and whose grid took the training time.
+
+    Args:
+        held: share of the time through which rates were full, before they fell to zero; None in
+            charts of before December 2026, in which they fell to a tenth all along.
+    """
     listed = ", ".join(
         f"{line.name} {'unknown' if gain is None else f'{gain:+.1f} dB'}"
         for line in lines
@@ -189,9 +194,11 @@ def settling(lines: Sequence[Line]) -> str:
     took = [line for line in lines if line.kept_up > HARDLY_TRAINED]
     hardly = [f"{line.name} for {line.kept_up:.0%} of its time" for line in took]
     kept_up = f" Updated its grid instead of training: {', '.join(hardly)}." if hardly else ""
+    full = "" if held is None else f"are full for {held:.0%} of the time that is given, and then "
+    end = "to a tenth over the time that is given" if held is None else "to zero"
     return (
-        f"Gained in the last third of the time: {listed}. {said} fall to a tenth over the time "
-        f"that is given, so that all may gain by more of it.{kept_up}"
+        f"Gained in the last third of the time: {listed}. {said} {full}fall {end}, so that all may "
+        f"gain by more of it.{kept_up}"
     )
 
 

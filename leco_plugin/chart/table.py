@@ -129,7 +129,7 @@ def table(results: Mapping[str, Any]) -> str:
     if duels := summary.rivals(lines, results["protocol"]["seconds"]):
         parts.append(versus_table(duels))
     if len(lines) > 1 and results["protocol"]["seconds"] is not None:
-        parts.append(settling(lines))
+        parts.append(settling(lines, results.get("rates_held")))
     if fallen := falls(lines):
         parts.append(f"{summary.sentence(fallen)}.")
     if failures := results["failures"]:

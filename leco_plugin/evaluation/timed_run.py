@@ -32,6 +32,7 @@ from leco_plugin.evaluation.metrics import decibels, image_metrics, spread_evenl
 from leco_plugin.evaluation.queries import GridUpdates, count_queries
 from leco_plugin.evaluation.report import finite_or_null
 from leco_plugin.hosts.learn_first import FIRST_TIMED, TIMED_STEPS, keep_within
+from leco_plugin.learning.schedule import rate_at
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.studio.host_models import leave_out_the_end, true_colours
 
@@ -118,9 +119,9 @@ def timed_run(
 ) -> tuple[TimedRun, Trainer]:
     """Trains until the budget is used and evaluates on the test images.
 
-    The learning rates of all groups decay to a tenth over the budget, whatever the number of steps:
-    nerfstudio's schedulers count steps, and a slow method would end with a high rate. A host that
-    learns its occupancy first has the full rates at its own first step.
+    The learning rates of all groups fall by `schedule.rate_at` over the budget, whatever the number
+    of steps: nerfstudio's schedulers count steps, and a slow method would end with a high rate. A
+    host that learns its occupancy first has the full rates until long after its own first step.
 
     Args:
         config: a method with its data; it is copied, not changed.
@@ -220,7 +221,7 @@ class _Course:
         share = self.budget.share(self.clock.seconds, step)
         trained = max(0.0, share - self.share_before) / max(1.0 - self.share_before, 1e-9)
         for group, rate in self.rates:
-            group["lr"] = rate * 0.1**trained
+            group["lr"] = rate * rate_at(trained)
         self.before_step = self.queries.copy()
         self.clock.start()
 

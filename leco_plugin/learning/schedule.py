@@ -16,6 +16,13 @@ MOST_EXTENSIONS = 2
 
 RATES = {"encoding": 2e-2, "field": 1e-2, "gate": 5e-3}
 """Learning rates of `leco-occupancy` for each of its parameter groups."""
+HELD = 0.75
+"""Share of a run through which learning rates stay full; then they fall to zero in a line."""
+
+
+def rate_at(share: float) -> float:
+    """Factor of learning rates at a share of a run, in [0, 1] (a cooldown, arXiv 2405.18392)."""
+    return min(1.0, max(0.0, (1.0 - share) / (1.0 - HELD)))
 
 
 @dataclass(frozen=True)

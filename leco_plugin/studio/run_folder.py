@@ -167,10 +167,11 @@ def counts_from_zero() -> bool:
         return False
 
 
-def end_of(trainer: Any) -> int:
-    """Steps of a run when it ends, those before it was resumed included."""
-    asked = int(trainer.config.max_num_iterations)
-    return asked if counts_from_zero() else int(trainer._start_step) + asked
+def end_of(config: Any, done: int) -> int:
+    """Steps of a run when it ends, by its trainer's config and the steps `done` when it began or
+    was resumed."""
+    asked = int(config.max_num_iterations)
+    return asked if counts_from_zero() else done + asked
 
 
 def iterations_until(end: int, done: int) -> int:
@@ -206,7 +207,7 @@ class TrainerRun:
     @property
     def end(self) -> float:
         """Of the trainer's config as it is now: a run of fixed time knows it only on the way."""
-        return float(end_of(self.trainer))
+        return float(end_of(self.trainer.config, self.trainer._start_step))
 
     def optimizers(self) -> list[Optimizer]:
         """Those of all parameter groups."""

@@ -28,6 +28,7 @@ from leco_plugin.names import options_in
 from leco_plugin.samplers.kernels import VARIABLE, kernels_off
 from leco_plugin.scenes.input_error import InputError, TrainingStopped, first_line, one_line
 from leco_plugin.studio.checkpoints import first_not_finite, previous_of, step_of, whole_of
+from leco_plugin.studio.cooldown import ending_at
 from leco_plugin.studio.run_folder import (
     check_photographs,
     checkpoint_of,
@@ -109,6 +110,8 @@ class AtomicTrainer(Trainer):
     with the highest step: one that was cut off half-way ends every attempt to go on.
     """
 
+    done_before = 0
+    """Steps of the run that is gone on with, by the name of its checkpoint."""
     saved_at = 0.0
     """When the last checkpoint was saved, or training began."""
     save_seconds = 0.0
@@ -137,7 +140,9 @@ class AtomicTrainer(Trainer):
         say_what_is_logged()
         _say_which_kernels_are_off()
         asked = self.config.pipeline.model
-        self.config = config = with_sizes_of(self.config, checkpoint_of(self.config))
+        checkpoint = checkpoint_of(self.config)
+        self.done_before = 0 if checkpoint is None else step_of(checkpoint) + 1
+        self.config = config = with_sizes_of(self.config, checkpoint)
         if config.logging.local_writer.enable:
             self.config = without_tables(config)
         try:
@@ -145,7 +150,8 @@ class AtomicTrainer(Trainer):
                 super().setup(*arguments, **options)
         finally:
             self.config = config
-        if self._start_step >= end_of(self):
+        end = end_of(config, self._start_step)
+        if self._start_step >= end:
             raise InputError(
                 f"the checkpoint has {counted(self._start_step, 'step')} already: this nerfstudio "
                 f"counts these in --max-num-iterations {self.config.max_num_iterations}, so give "
@@ -157,11 +163,13 @@ class AtomicTrainer(Trainer):
         self.callbacks.append(TrainingCallback(where, self.save_by_the_clock))
         self.callbacks.append(TrainingCallback(where, self.stop_if_asked))
         if self.config.logging.local_writer.enable and is_first():
-            self.progress = RunProgress(self, end_of(self))
+            self.progress = RunProgress(self, end)
 
     def setup_optimizers(self) -> Optimizers:
-        """nerfstudio's, which resume with the parameters that a checkpoint has left the model."""
-        return PrunedOptimizers(self.config.optimizers.copy(), self.pipeline)
+        """nerfstudio's, which resume with the parameters that a checkpoint has left the model;
+        rates know where the run ends."""
+        optimizers = ending_at(self.config.optimizers, end_of(self.config, self.done_before))
+        return PrunedOptimizers(optimizers, self.pipeline)
 
     def train_iteration(self, step: int) -> Any:
         """As nerfstudio's; the PSNR of its batch is kept for the screen."""
@@ -188,7 +196,7 @@ class AtomicTrainer(Trainer):
             self.save_checkpoint(step)
         parts = [f"step {step}: stopped by Ctrl-C", self._what_is_left()]
         if saved := self._saved():  # a step in doubt is not saved: it goes on from the one before
-            done, end = step_of(saved[-1]) + 1, end_of(self)
+            done, end = step_of(saved[-1]) + 1, end_of(self.config, self._start_step)
             steps = f"--max-num-iterations {iterations_until(end, done)}"
             resume = f"the same command with --load-dir {self.checkpoint_dir} {steps} goes on"
             typed = {"--load-dir", "--max-num-iterations"}.intersection(options_in(sys.argv))

@@ -246,7 +246,9 @@ def test_who_rises_or_may_rise_is_named_and_nobody_is_said_to_have_had_enough() 
     lines = lines_of(results(run("A", curve=STILL), run("B", curve=RISING)))
     said = settling(lines)
     assert "A +0.2 dB, B +3.0 dB. Still rising: B; rates" in said
-    assert "A +0.2 dB. Rates fall" in settling(lines[:1])
+    assert "A +0.2 dB. Rates fall to a tenth over the time" in settling(lines[:1])
+    cooled = settling(lines, held=0.6)
+    assert "rates are full for 60% of the time that is given, and then fall to zero," in cooled
     assert "Still rising: all of them;" in settling(lines[1:])
     late = lines_of(results(run("A", curve=STILL), run("C", curve=[[9.0, 17.0]])))
     assert "C unknown. Still rising: C;" in settling(late)

@@ -54,7 +54,7 @@ def rate_at(course: _Course, group: Any, seconds: float, step: int) -> float:
     return float(group["lr"])
 
 
-def test_rates_of_a_host_that_learns_first_decay_from_its_own_first_step() -> None:
+def test_rates_of_a_host_that_learns_first_count_from_its_own_first_step() -> None:
     host = nn.Linear(1, 1)
     host.leco_guide = nn.Module()
     host.leco_guide.occupancy = None
@@ -64,12 +64,12 @@ def test_rates_of_a_host_that_learns_first_decay_from_its_own_first_step() -> No
     course.clock.seconds = 40.0  # learning is a part of the first step
     course.begun(0)
     assert course.run.learn_seconds == pytest.approx(40.0, abs=1.0)
-    assert rate_at(course, group, 40.0, 1) == pytest.approx(RATE, rel=0.02)
-    assert rate_at(course, group, 70.0, 100) == pytest.approx(RATE * 0.1**0.5, rel=0.02)
-    assert rate_at(course, group, 100.0, 200) == pytest.approx(RATE * 0.1, rel=0.02)
+    assert rate_at(course, group, 84.5, 1) == pytest.approx(RATE, rel=0.02)
+    assert rate_at(course, group, 91.0, 100) == pytest.approx(RATE * 0.6, rel=0.02)
+    assert rate_at(course, group, 100.0, 200) == 0.0
 
 
-def test_rates_of_a_model_that_goes_on_with_what_it_learned_decay_over_all_of_its_time() -> None:
+def test_rates_of_a_model_that_goes_on_with_what_it_learned_count_all_of_its_time() -> None:
     model = nn.Linear(1, 1)
     course, group = course_of(model)
     model.mixture = nn.Module()
@@ -77,7 +77,8 @@ def test_rates_of_a_model_that_goes_on_with_what_it_learned_decay_over_all_of_it
     course.clock.seconds = 40.0
     course.begun(50)
     assert course.run.learn_seconds == pytest.approx(40.0, abs=1.0)
-    assert rate_at(course, group, 50.0, 51) == pytest.approx(RATE * 0.1**0.5)
+    assert rate_at(course, group, 74.0, 51) == RATE
+    assert rate_at(course, group, 90.0, 52) == pytest.approx(RATE * 0.4)
 
 
 class Time:

@@ -70,10 +70,10 @@ def test_a_run_ends_where_its_trainer_stops(installed: type[Trainer], from_zero:
     for start in (0, 30):
         trainer = resumed(installed, 50, start)
         trainer.train()
-        assert end_of(trainer) == trainer.step + 1
+        assert end_of(trainer.config, start) == trainer.step + 1
         again = resumed(installed, iterations_until(90, done=start), start)
         again.train()
-        assert end_of(again) == again.step + 1 == 90
+        assert end_of(again.config, start) == again.step + 1 == 90
 
 
 def test_without_its_source_it_is_the_release(monkeypatch: pytest.MonkeyPatch) -> None:
