@@ -20,7 +20,7 @@ from leco_plugin.learning.schedule import KEPT_ABOVE
 from leco_plugin.models import figures
 from leco_plugin.models.compute.device import fast_precision, keep_freed_memory
 from leco_plugin.models.leco_config import LecoModelConfig
-from leco_plugin.models.losses import require_finite
+from leco_plugin.models.losses import color_loss, require_finite
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.objective import field_losses, gate_losses
 from leco_plugin.models.rendering import Intervals, Rays, Routing, Shaded
@@ -182,11 +182,15 @@ class LecoModel(DrawnInViewer, Model):
         self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: Any = None
     ) -> dict[str, Tensor]:
         """Colour loss, distortion loss, and before the gate is frozen what teaches it. ValueError
-        if the batch holds no rays, FloatingPointError if a loss is not finite: no step is taken."""
+        if the batch holds no rays, FloatingPointError if a loss is not finite: no step is taken.
+        Of a batch that is evaluated the colour loss alone."""
+        image = batch["image"].to(self.device)
+        if "shaded" not in outputs:
+            truth = self.renderer_rgb.blend_background(image)
+            return {"rgb_loss": color_loss(outputs["rgb"], truth)}
         shaded: Shaded = outputs["shaded"]
         batch_of = shaded, outputs["intervals"], outputs["rays"]
         config, region, plan = self.config, self.mixture.region, self.plan
-        image = batch["image"].to(self.device)
         if len(image) == 0:
             raise ValueError("a training batch holds no rays: are all pixels masked?")
         known = batch.get(DISTANCE)

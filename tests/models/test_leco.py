@@ -20,6 +20,7 @@ from leco_plugin.models.field import FieldConfig
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.leco_config import LecoModelConfig
+from leco_plugin.models.losses import color_loss
 from leco_plugin.models.mixture import Following
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.rendering import Intervals, Rays, backdrop_of
@@ -73,6 +74,14 @@ def test_a_sound_batch_has_finite_losses(model: LecoModel) -> None:
     losses = model.get_loss_dict(*step(model))
     assert len(losses) >= 5
     assert all(bool(torch.isfinite(loss)) for loss in losses.values())
+
+
+def test_a_batch_that_is_evaluated_has_the_loss_of_its_colours_alone(model: LecoModel) -> None:
+    """nerfstudio asks for it every `steps_per_eval_batch` steps."""
+    outputs, batch = step(model.eval())
+    image = torch.cat([batch["image"], torch.full((NUM_RAYS, 1), 0.25)], dim=-1)
+    losses = model.get_loss_dict(outputs, {"image": image})
+    assert losses == {"rgb_loss": color_loss(outputs["rgb"], 0.25 * image[:, :3])}
 
 
 @pytest.mark.parametrize(
