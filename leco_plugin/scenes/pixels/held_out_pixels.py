@@ -108,8 +108,11 @@ def look_up(source: Any, which: Tensor, places: Tensor) -> Tensor:
     rows, columns = places.unbind(dim=-1)
     if isinstance(source, Tensor):
         return source[which.to(source.device), rows.to(source.device), columns.to(source.device)]
-    values = [source[i][r, c] for i, r, c in zip(which, rows, columns)]
-    return torch.stack(values) if values else source[0].new_zeros(0, *source[0].shape[2:])
+    values, order = source[0].new_zeros(len(which), *source[0].shape[2:]), which.argsort()
+    numbers, counts = which[order].unique_consecutive(return_counts=True)
+    for number, own in zip(numbers.tolist(), order.split(counts.tolist())):
+        values[own] = source[number][rows[own], columns[own]]
+    return values
 
 
 def sizes_of(pictures: Any) -> Tensor:
@@ -181,16 +184,22 @@ class HeldOutPixelSampler(PixelSampler):
     ) -> Tensor:
         """Pixels [N, 3] int64 of a mask [P, H, W, 1]; nerfstudio's own cannot sample one image.
         InputError if the mask leaves none."""
-        seen = mask.reshape(num_images, image_height, image_width).bool()
+        seen = mask.reshape(num_images, image_height, image_width)
         sizes = torch.tensor([num_images, image_height, image_width], device=device)
-        indices = (torch.rand((num_samples, 3), device=device) * sizes).long()
-        image, row, column = indices.to(seen.device).unbind(dim=-1)
-        hidden = ~seen[image, row, column].to(device)
-        if bool(hidden.any()):
-            others = seen.nonzero().to(device)
-            if len(others) == 0:
-                raise InputError("the masks leave no pixel of the training images")
-            indices[hidden] = others[torch.randint(len(others), (int(hidden.sum()),))]
+        indices = torch.zeros(num_samples, 3, dtype=torch.long, device=device)
+        hidden = torch.arange(num_samples, device=device)
+        for _ in range(TRIES):
+            drawn = (torch.rand(len(hidden), 3, device=device) * sizes).long()
+            indices[hidden] = drawn
+            image, row, column = drawn.to(seen.device).unbind(dim=-1)
+            hidden = hidden[~seen[image, row, column].bool().to(device)]
+            if len(hidden) == 0:
+                return indices
+        # of masks that leave next to nothing; to list the pixels of all images takes seconds
+        others = seen.nonzero().to(device)
+        if len(others) == 0:
+            raise InputError("the masks leave no pixel of the training images")
+        indices[hidden] = others[torch.randint(len(others), (len(hidden),))]
         return indices
 
     def sample(self, image_batch: dict[str, Any]) -> dict[str, Any]:
@@ -201,6 +210,36 @@ class HeldOutPixelSampler(PixelSampler):
         self.numbers = on_cpu(torch.as_tensor(image_batch["image_idx"]))
         batch: dict[str, Any] = super().sample(image_batch)
         return batch
+
+    def collate_image_dataset_batch_list(
+        self, batch: dict[str, Any], num_rays_per_batch: int, keep_full_image: bool = False
+    ) -> dict[str, Any]:
+        """A batch of pictures of several sizes, lists of [H, W, C], with equal shares of all.
+
+        nerfstudio's own wants an even number of rays, never draws of some of many pictures, and
+        sorts its rays by pictures.
+        """
+        pictures, masks, numbers = batch["image"], batch.get("mask"), self.numbers
+        on_sphere = self.config.is_equirectangular and masks is None
+        draw = self.sample_method_equirectangular if on_sphere else self.sample_method
+        share, rest = divmod(num_rays_per_batch, len(pictures))
+        counts = torch.full((len(pictures),), share)
+        counts[torch.randperm(len(pictures))[:rest]] += 1
+        chosen = counts.nonzero()[:, 0]
+        self.numbers, found = numbers[chosen], []
+        for number in chosen.tolist():
+            picture, mask = pictures[number], None if masks is None else masks[number][None]
+            found.append(draw(int(counts[number]), 1, *picture.shape[:2], mask, picture.device))
+            found[-1][:, 0] = number
+        places = torch.cat(found)[torch.randperm(num_rays_per_batch)].cpu()
+        values = {
+            key: look_up(source, places[:, 0], places[:, 1:])
+            for key, source in batch.items()
+            if key not in ("image_idx", "mask") and source is not None
+        }
+        whole = {"full_image": pictures} if keep_full_image else {}
+        indices = torch.cat([numbers[places[:, :1]], places[:, 1:]], dim=-1)
+        return {**values, "indices": indices, **whole}
 
     def shown(self, pixels: Tensor, sizes: Tensor, numbers: Tensor | None = None) -> Tensor:
         """Whether a fisheye shows pixels (image, row, column) [N, 3]: bool [N]. Sizes (height,

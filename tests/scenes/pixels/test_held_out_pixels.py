@@ -175,6 +175,27 @@ def test_images_of_many_sizes_are_sampled_as_a_list() -> None:
         assert torch.equal(color, pictures[image][row, column])
 
 
+@pytest.mark.parametrize("rays", [5, 6])
+def test_of_pictures_of_many_sizes_all_are_drawn_alike_and_in_any_order(rays: int) -> None:
+    """nerfstudio's own wants an even number of rays, and draws of the last of the pictures only."""
+    torch.manual_seed(0)
+    pictures = [torch.rand(20 + number, 30, 3) for number in range(7)]
+    batch = {"image": pictures, "image_idx": torch.tensor([3, 9, 8, 4, 6, 2, 5])}
+    made, first, often = sampler(), torch.zeros(10), torch.zeros(10)
+    made.set_num_rays_per_batch(rays)
+    for _ in range(140):
+        samples = made.sample(dict(batch))
+        numbers = samples["indices"][:, 0]
+        assert len(samples["image"]) == rays == len(numbers.unique())
+        for color, (image, row, column) in zip(samples["image"], samples["indices"].tolist()):
+            place = batch["image_idx"].tolist().index(image)
+            assert torch.equal(color, pictures[place][row, column])
+        often += torch.bincount(numbers, minlength=10)
+        first[numbers[0]] += 1
+    assert often[batch["image_idx"]].tolist() == pytest.approx([20 * rays] * 7, rel=0.2)
+    assert bool((first[batch["image_idx"]] > 5).all())
+
+
 @pytest.mark.parametrize("kind", ["tensor", "list"])
 def test_no_pixels_have_no_values_of_the_right_shape_and_type(kind: str) -> None:
     images = torch.zeros(2, 20, 30, 3, dtype=torch.uint8)
@@ -211,6 +232,18 @@ def test_a_mask_is_sampled_evenly() -> None:
     found = sampler().rejection_sample_mask(mask, 4000, 1, 10, 20, "cpu")
     assert bool(mask[tuple(found.unbind(dim=-1))].all())
     assert (found[:, 2].bincount() - 1000).abs().max() < 150
+
+
+def test_the_pixels_of_a_mask_are_not_listed_where_it_leaves_many(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A list of those of a survey has gigabytes, and takes longer than a step."""
+    batch = images(masked=True)
+    monkeypatch.setattr(batch["mask"].__class__, "nonzero", None)
+    found = sampler().rejection_sample_mask(batch["mask"], 4000, 3, 40, 39, "cpu")
+    monkeypatch.undo()
+    assert bool(batch["mask"][tuple(found.unbind(dim=-1))].all())
+    assert found.float().mean(dim=0).tolist() == pytest.approx([1.0, 19.5, 19.0], abs=0.8)
 
 
 def test_a_mask_without_a_pixel_is_an_input_error() -> None:
