@@ -173,8 +173,8 @@ def dense_rendering(
 
 
 def in_chunks(rays: Rays, at_once: int) -> list[Rays]:
-    """Rays, so many at a time."""
+    """Rays, so many at a time; of none an empty part."""
     return [
         Rays._make(None if part is None else part[first : first + at_once] for part in rays)
-        for first in range(0, len(rays.origins), at_once)
+        for first in range(0, max(1, len(rays.origins)), at_once)
     ]

@@ -18,10 +18,13 @@ from leco_plugin.capacity.references import (
     Part,
     Reference,
     declared,
+    find_references,
     measure_original,
+    pair_sides,
     verify,
 )
 from leco_plugin.capacity.search import MARGIN, kept_of_box, lower_threshold
+from leco_plugin.capacity.sources import Source, draw_held_out
 from leco_plugin.learning.calibration import THRESHOLDS
 from leco_plugin.occupancy import Occupancy
 
@@ -65,6 +68,19 @@ def on_its_boundary() -> Ground:
 
 def lost_at(occupancy: Occupancy, evidence: Evidence, threshold: float) -> float:
     return loss(evidence, occupancy.query(evidence.positions) < threshold).share
+
+
+def test_photographs_with_fewer_pixels_than_are_wanted_give_what_they_have(
+    known: tuple[Source, Occupancy], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of the search take what is left beside the held-out pixels: none is left to verify."""
+    monkeypatch.setattr("leco_plugin.capacity.references.RAYS", 1 << 15)
+    source, original = known
+    sides = pair_sides(source, original, draw_held_out(source, original, 30))
+    (reference,) = find_references(source, original, sides)
+    searched, verified = reference.search.evidence, reference.verify.evidence
+    assert 3000 < searched.rays <= 7 * 32 * 32 - 30 and verified.rays == 30
+    assert int(searched.ray_indices.max()) < searched.rays and float(verified.worth.sum()) > 0.0
 
 
 @pytest.mark.parametrize("part", [0.3, 0.7])
