@@ -30,6 +30,17 @@ from leco_plugin.studio.trainer import AtomicTrainer
 LOST = ("Connection closed by peer", "Connection reset by peer", "NCCL communicator was aborted")
 """What gloo and NCCL say of a process that is gone."""
 
+AT_LEAST_ONE = (
+    *("pipeline.datamanager.train-num-rays-per-batch", "pipeline.model.eval-num-rays-per-chunk"),
+    *("pipeline.fewest-rays", "pipeline.most-rays"),
+)
+"""Options that count rays, of the methods that have them."""
+
+
+def part_of(config: Any, option: str) -> Any:
+    """An option of a part of a config, None where there is no such."""
+    return getattr(config, option.replace("-", "_"), None)
+
 
 @dataclass
 class DataParallelTrainerConfig(TrainerConfig):
@@ -57,12 +68,16 @@ class DataParallelTrainerConfig(TrainerConfig):
             prepare_launcher(on_cpu=self.machine.device_type == "cpu")
 
     def _require_what_is_named(self) -> None:
-        """InputError, before anything of a run is written, if there is no step to take, or no such
-        folder or file."""
+        """InputError, before anything of a run is written, if there is no step to take, no ray in a
+        batch, or no such folder or file."""
         if self.max_num_iterations < 1:
             raise InputError(
                 f"--max-num-iterations is {self.max_num_iterations}; a run needs at least one step"
             )
+        for option in AT_LEAST_ONE:
+            number = functools.reduce(part_of, option.split("."), self)
+            if number is not None and number < 1:
+                raise InputError(f"--{option} is {number}; it must be at least 1")
         named = {
             "data": self.data,
             "load-dir": self.load_dir,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import os
 import signal
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import pytest
 from forked_commands import ForkedCommands
 
+from leco_plugin.host_configs import leco_ngp
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.scenes import whole_files
 from leco_plugin.scenes.input_error import InputError
@@ -141,3 +143,22 @@ def test_a_config_goes_to_a_folder_of_its_own_and_says_so(tmp_path: Path, printe
     assert "this run goes to" in printed()
     for made in (first, second):
         release(made.get_base_dir())
+
+
+@pytest.mark.parametrize(
+    ("method", "option"),
+    [
+        (leco_occupancy, "pipeline.datamanager.train-num-rays-per-batch"),
+        (leco_occupancy, "pipeline.model.eval-num-rays-per-chunk"),
+        (leco_ngp, "pipeline.fewest-rays"),
+        (leco_ngp, "pipeline.most-rays"),
+    ],
+)
+def test_a_batch_without_rays_is_refused_before_the_run(method: Any, option: str) -> None:
+    config: Any = copy.deepcopy(method.config)
+    *parts, name = option.replace("-", "_").split(".")
+    setattr(functools.reduce(getattr, parts, config), name, 0)
+    with pytest.raises(InputError, match=f"--{option} is 0; it must be at least 1"):
+        config.set_timestamp()
+    setattr(functools.reduce(getattr, parts, config), name, 1)
+    config.set_timestamp()

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from leco_plugin.on_cpu import on_cpu
 from leco_plugin.scenes.bounds import FEWEST_POINTS
+from leco_plugin.scenes.input_error import require
 from leco_plugin.scenes.lenses import bend
 from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler, Lattice, look_up
 
@@ -110,6 +111,10 @@ class KnownDistancePixelSamplerConfig(PixelSamplerConfig):
     known_share: float = 0.25
     """Share of a batch with known distances, as long as the model asks for them."""
 
+    def __post_init__(self) -> None:
+        share = self.known_share
+        require(0.0 <= share <= 1.0, "pixel-sampler.known-share", share, "from 0 to 1")
+
 
 def sampler_here(datamanager: Any) -> Any:
     """The sampler that training batches are drawn with, if in this process: nerfstudio's parallel
@@ -156,8 +161,8 @@ class KnownDistancePixelSampler(HeldOutPixelSampler):
             len(sparse.distances), (round(self.config.known_share * len(batch["indices"])),)
         )
         pixels = sparse.indices[drawn]
-        # a batch may be of some of the images only
-        place_of = torch.full((int(max(numbers.max(), pixels[:, 0].max())) + 1,), -1)
+        # a batch may be of some of the images only, and too small for its share
+        place_of = torch.full((int(torch.cat([numbers, pixels[:, 0]]).max()) + 1,), -1)
         place_of[numbers] = torch.arange(len(numbers))
         loaded = place_of[pixels[:, 0]] >= 0
         if self.set_aside is not None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
+from scene_files import refused
 
 from leco_plugin.scenes.bounds import FEWEST_POINTS
 from leco_plugin.scenes.pixels.held_out_pixels import Lattice
@@ -149,6 +151,22 @@ def test_known_rays_have_the_colour_the_place_and_the_distance_of_their_pixel(ki
         assert torch.equal(pixels["indices"][row], expected)
         colour = torch.tensor([int(expected[0]) - 7, *expected[1:].tolist()]).float()
         assert torch.equal(pixels["image"][row].float(), colour)
+
+
+@pytest.mark.parametrize(("share", "rays"), [(0.0, 400), (0.25, 1)])
+def test_a_batch_whose_share_is_no_whole_pixel_has_no_known_distance(
+    share: float, rays: int
+) -> None:
+    made = sampler(known_share=share)
+    made.sparse, made.num_rays_per_batch = known(), rays
+    pixels = made.sample(images())
+    assert pixels[DISTANCE].tolist() == [0.0] * rays == [0.0] * len(pixels["image"])
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.1, math.nan])
+def test_a_share_beyond_a_batch_is_refused_in_a_line(share: float) -> None:
+    with refused(r"known-share is .*; it must be from 0 to 1"):
+        sampler(known_share=share)
 
 
 def test_masked_pixels_are_left_out() -> None:
