@@ -27,6 +27,7 @@ from leco_plugin.scenes.pixels.held_out_pixels import (
 from leco_plugin.scenes.pixels.known_distances import (
     KnownDistancePixelSampler,
     SparsePixels,
+    drawable,
     sampler_here,
     sparse_pixels,
 )
@@ -84,7 +85,7 @@ class LearningData:
                 sampler.set_aside[chosen] = True
         if isinstance(sampler, KnownDistancePixelSampler):
             sampler.sparse = self.sparse if distances else None
-        rays = round(self.rays_per_batch * factor)
+        rays = drawable(round(self.rays_per_batch * factor), self.manager)
         if sampler is not None and sampler.num_rays_per_batch != rays:
             sampler.set_num_rays_per_batch(rays)
 

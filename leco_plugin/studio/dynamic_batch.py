@@ -14,6 +14,7 @@ from nerfstudio.pipelines.dynamic_batch import DynamicBatchPipeline, DynamicBatc
 from torch import Tensor
 
 from leco_plugin.models.compute.ranks import mean
+from leco_plugin.scenes.pixels.known_distances import drawable
 
 MOST_GROWTH = 2.0
 """Factor by which a batch may grow from one step to the next; it shrinks as far as it must."""
@@ -60,7 +61,8 @@ class ClampedDynamicBatchPipeline(DynamicBatchPipeline):
     def _set_rays(self, wanted: int) -> None:
         fewest = getattr(self.config, "fewest_rays", FEWEST_RAYS)
         most = getattr(self.config, "most_rays", MOST_RAYS)
-        self.dynamic_num_rays_per_batch = min(most, max(fewest, wanted))
+        rays = min(most, max(fewest, wanted))
+        self.dynamic_num_rays_per_batch = drawable(rays, self.datamanager)
         self.rays_per_batch.fill_(self.dynamic_num_rays_per_batch)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 import yaml
+from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.pipelines.dynamic_batch import DynamicBatchPipeline, DynamicBatchPipelineConfig
 from nerfstudio.utils import writer
@@ -18,6 +19,7 @@ from leco_plugin.host_configs import leco_ngp
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
+from leco_plugin.scenes.pixels import known_distances
 from leco_plugin.space import Space, SpaceKind
 from leco_plugin.studio.dynamic_batch import (
     MOST_GROWTH,
@@ -103,6 +105,19 @@ def test_the_batch_follows_the_samples_that_rays_have_within_bounds(
     pipeline: ClampedDynamicBatchPipeline, rays: int, samples: int, then: int
 ) -> None:
     assert rays_after(pipeline, rays, samples) == then
+
+
+def test_of_pictures_of_many_sizes_a_sampler_of_nerfstudio_is_asked_for_even_numbers(
+    pipeline: ClampedDynamicBatchPipeline, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sizes, samples = torch.tensor([[3, 4], [4, 3]]), 4 * TARGET
+    monkeypatch.setattr(known_distances, "picture_sizes", lambda dataset: sizes)
+    assert rays_after(pipeline, 100, samples) == 25
+    plain = PixelSamplerConfig().setup()
+    monkeypatch.setattr(pipeline.datamanager, "train_pixel_sampler", plain)
+    assert rays_after(pipeline, 100, samples) == 26
+    sizes[1] = sizes[0]
+    assert rays_after(pipeline, 100, samples) == 25
 
 
 def test_the_first_batch_keeps_to_the_bounds(tiny_scene: Path, tmp_path: Path) -> None:

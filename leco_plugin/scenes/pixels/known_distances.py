@@ -18,6 +18,7 @@ from leco_plugin.scenes.bounds import FEWEST_POINTS
 from leco_plugin.scenes.input_error import require
 from leco_plugin.scenes.lenses import bend
 from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler, Lattice, look_up
+from leco_plugin.scenes.pixels.stored_pictures import picture_sizes
 
 NEARER = 0.9
 """A point hides its neighbours in the image that are farther than it by more than this factor."""
@@ -124,6 +125,16 @@ def sampler_here(datamanager: Any) -> Any:
     return getattr(datamanager, "train_pixel_sampler", None)
 
 
+def drawable(rays: int, manager: Any) -> int:
+    """So many rays, or one more where nerfstudio's own sampler draws from photographs of several
+    sizes: it draws even numbers alone."""
+    sampler = getattr(manager, "train_pixel_sampler", None)
+    if rays % 2 == 0 or sampler is None or isinstance(sampler, HeldOutPixelSampler):
+        return rays
+    sizes = picture_sizes(manager.train_dataset)
+    return rays if bool((sizes == sizes[0]).all()) else rays + 1
+
+
 @contextmanager
 def batches_of(rays: int, manager: Any) -> Iterator[None]:
     """A data manager's batches have so many rays meanwhile, where it has them drawn here."""
@@ -132,7 +143,7 @@ def batches_of(rays: int, manager: Any) -> Iterator[None]:
         yield
         return
     before = sampler.num_rays_per_batch
-    sampler.set_num_rays_per_batch(rays)
+    sampler.set_num_rays_per_batch(drawable(rays, manager))
     try:
         yield
     finally:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from scene_files import refused
 
 from leco_plugin.scenes.bounds import FEWEST_POINTS
@@ -17,6 +19,7 @@ from leco_plugin.scenes.pixels.known_distances import (
     KnownDistancePixelSampler,
     KnownDistancePixelSamplerConfig,
     SparsePixels,
+    batches_of,
     hidden,
     sparse_pixels,
 )
@@ -193,6 +196,22 @@ def of_many_sizes() -> dict[str, Any]:
     """The images 7 and 8; 7 is narrower."""
     pictures = [torch.zeros(20, 12, 3), torch.zeros(20, 30, 3)]
     return {"image": pictures, "image_idx": torch.tensor([7, 8])}
+
+
+def test_nerfstudios_sampler_can_draw_any_batch_of_pictures_of_many_sizes() -> None:
+    batch, plain = of_many_sizes(), PixelSamplerConfig().setup()
+    dataset = SimpleNamespace(cameras=cameras())
+    manager = SimpleNamespace(train_pixel_sampler=plain, train_dataset=dataset)
+    with batches_of(45, manager):
+        assert plain.num_rays_per_batch == 45
+    dataset.cameras.height[1] += 3
+    with batches_of(45, manager):
+        assert len(plain.sample(batch)["indices"]) == 46
+    with batches_of(44, manager):
+        assert len(plain.sample(batch)["indices"]) == 44
+    manager.train_pixel_sampler = sampler()
+    with batches_of(45, manager):
+        assert len(manager.train_pixel_sampler.sample(batch)["indices"]) == 45
 
 
 def test_a_batch_of_many_sizes_may_hold_no_known_pixel() -> None:
