@@ -38,11 +38,12 @@ def allow_checkpoint_globals() -> None:
 
 
 def refuse_earlier(state_dict: dict[str, Any], prefix: str, name: str) -> None:
-    """InputError for the state of a module of before: one that has anything, but not a name of
-    today."""
+    """InputError for the state of a module of before, or of another: one that has anything, but not
+    a name of today."""
     names = [key for key in state_dict if key.startswith(prefix)]
     if names and f"{prefix}{name}" not in names:
-        raise InputError(f"the checkpoint {ANOTHER_VERSION}")
+        version = ANOTHER_VERSION.removeprefix("is ")
+        raise InputError(f"the checkpoint is of another method, or {version}")
 
 
 def previous_of(checkpoints: Path) -> Path:

@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer
@@ -80,6 +81,21 @@ def _trackers_in_one_line(vis: str) -> Iterator[None]:
             raise
         fault = f"--vis {vis} cannot begin ({one_line(error, 120)})"
         raise InputError(f"{fault}: log in there, or give --vis tensorboard") from error
+
+
+@contextmanager
+def _misfits_in_one_line() -> Iterator[None]:
+    """InputError for a checkpoint that is not of this model with these optimizers."""
+    try:
+        yield
+    except (InputError, torch.OutOfMemoryError):
+        raise
+    except (KeyError, RuntimeError, ValueError) as error:
+        fault = (
+            f"the checkpoint does not fit this method with these options ({one_line(error, 120)})"
+        )
+        remedy = "go on with the method and options of its run, or begin a new run without it"
+        raise InputError(f"{fault}: {remedy}") from error
 
 
 class PrunedOptimizers(Optimizers):
@@ -239,15 +255,17 @@ class AtomicTrainer(Trainer):
 
     def _load_checkpoint(self) -> None:
         """As nerfstudio's, from the newest checkpoint of a folder that is whole. InputError for
-        none."""
+        none, and for one that is of another method or of other options."""
         config, folder = self.config, self.config.load_dir
         if folder is None or config.load_step is not None:
-            super()._load_checkpoint()
+            with _misfits_in_one_line():
+                super()._load_checkpoint()
             return
         path = whole_of(folder, "going on from {}")
         self.config = replace(config, load_dir=None, load_checkpoint=path)
         try:
-            super()._load_checkpoint()
+            with _misfits_in_one_line():
+                super()._load_checkpoint()
         finally:
             self.config = config
 

@@ -255,6 +255,39 @@ def test_an_empty_folder_has_no_checkpoint(trainer: AtomicTrainer, tmp_path: Pat
         trainer._load_checkpoint()
 
 
+MISFIT = "the checkpoint does not fit this method with these options "
+
+
+@pytest.mark.parametrize("by_folder", [True, False])
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (KeyError("field"), rf"^{MISFIT}\('field'\): go on with the method and options of its run"),
+        (RuntimeError("one\nsize"), rf"^{MISFIT}\(one size\): go on"),
+        (ValueError("another size"), rf"^{MISFIT}\(another size\): go on"),
+        (InputError("fewer photographs"), "^fewer photographs$"),
+    ],
+)
+def test_a_checkpoint_of_another_method_is_refused_in_a_line(
+    error: Exception,
+    said: str,
+    by_folder: bool,
+    trainer: AtomicTrainer,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def load(_: Trainer) -> None:
+        raise error
+
+    monkeypatch.setattr(Trainer, "_load_checkpoint", load)
+    trainer.save_checkpoint(10)
+    folder = trainer.checkpoint_dir
+    file = folder / "step-000000010.ckpt"
+    trainer.config = asked = Loading(folder) if by_folder else Loading(None, file)
+    with pytest.raises(InputError, match=said) as caught:
+        trainer._load_checkpoint()
+    assert "\n" not in str(caught.value) and trainer.config == asked
+
+
 def test_kernels_that_are_off_are_said_before_training(
     monkeypatch: pytest.MonkeyPatch, printed: Any
 ) -> None:
