@@ -75,7 +75,7 @@ class DataParallelTrainerConfig(TrainerConfig):
                 f"--max-num-iterations is {self.max_num_iterations}; a run needs at least one step"
             )
         for option in AT_LEAST_ONE:
-            number = functools.reduce(part_of, option.split("."), self)
+            number: Any = functools.reduce(part_of, option.split("."), self)
             if number is not None and number < 1:
                 raise InputError(f"--{option} is {number}; it must be at least 1")
         named = {
