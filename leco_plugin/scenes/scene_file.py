@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
+from unicodedata import normalize
 
 import numpy as np
 from nerfstudio.cameras.cameras import Cameras
@@ -54,8 +55,8 @@ class SceneFile:
         return [find_file(self.folder / frame["file_path"]) for frame in self.frames]
 
     def mask(self, name: str) -> Path:
-        """The file of a mask by its name, also as Windows writes it."""
-        return self.path.parent / name.replace("\\", "/")
+        """The file of a mask, by its name as `find_file` takes it; where it would be if missing."""
+        return find_file(self.path.parent / name.replace("\\", "/"))
 
 
 def file_in(data: Path) -> Path:
@@ -199,14 +200,15 @@ def _add(scene: SceneFile, data: Path) -> str:
 def frames_of(images: list[Path], scene: SceneFile) -> list[int | None]:
     """The number of the frame of each picture, which may be a smaller one of the same name; None
     where no frame has it. InputError if frames of several folders would share a smaller picture."""
-    places = [str(frame["file_path"]).replace("\\", "/") for frame in scene.frames]
+    places = [_one_spelling(str(frame["file_path"])) for frame in scene.frames]
     named: dict[str, list[int]] = {}
     for number, place in enumerate(places):
         named.setdefault(place.rsplit("/", 1)[-1], []).append(number)
     found: list[int | None] = []
-    for image in images:
+    folder = Path(_one_spelling(str(scene.folder)))
+    for image in (Path(_one_spelling(str(each))) for each in images):
         numbers = named.get(image.name) or named.get(image.stem) or []
-        paths = [scene.folder / places[number] for number in numbers]
+        paths = [folder / places[number] for number in numbers]
         files = [(path, path.with_name(f"{path.name}{image.suffix}")) for path in paths]
         ends = [number for number, either in zip(numbers, files) if image in either]
         others = sorted({places[number] for number in numbers})
@@ -215,6 +217,11 @@ def frames_of(images: list[Path], scene: SceneFile) -> list[int | None]:
             raise InputError(f"{fault}: give them names of their own")
         found.append(next(iter(ends or numbers), None))
     return found
+
+
+def _one_spelling(name: str) -> str:
+    """The same of all names for which `find_file` may find one file, but for its ending."""
+    return normalize("NFC", name.replace("\\", "/"))
 
 
 def factor_of(scene: SceneFile, numbers: list[int | None], config: Any, cameras: Cameras) -> int:

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unicodedata import normalize
 
 import mega_nerf_scene
 import numpy as np
@@ -26,7 +27,7 @@ from scene_files import change, described, refused, write_colmap
 
 from leco_plugin.scenes.frames import POINTS, check_no_contradiction
 from leco_plugin.scenes.mega_nerf import MegaNerfDataParserConfig
-from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
+from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig, read_scene
 from leco_plugin.scenes.reading import read_checked
 from leco_plugin.scenes.scene_file import remedy_for
 
@@ -541,6 +542,27 @@ def test_a_circle_of_a_frame_is_read(scene: Path) -> None:
     change(scene, edit)
     for reader in ("leco-photographs", "instant-ngp-data"):
         assert read(READERS[reader](scene)).cameras.metadata["fisheye_crop_radius"] == 9.0
+
+
+def test_a_frame_has_its_lens_and_mask_however_accents_of_its_name_are_stored(scene: Path) -> None:
+    def edit(meta: dict[str, Any]) -> None:
+        (scene / "masks").mkdir()
+        for split in ("train", "val", "test"):
+            del meta[f"{split}_filenames"]
+        for number, frame in enumerate(meta["frames"]):
+            mask = f"masks/é{number}"
+            Image.new("L", (32, 32), 255).save(scene / normalize("NFD", f"{mask}.png"))
+            name = f"images/ö{number}.png"
+            (scene / frame["file_path"]).rename(scene / normalize("NFD", name))
+            frame |= {"file_path": name, "mask_path": mask, "fl_x": 20.0 + number}
+            frame |= {"camera_model": "OPENCV_FISHEYE" if number % 3 else "OPENCV"}
+
+    frames = change(scene, edit)["frames"]
+    outputs = read(READERS["leco-photographs"](scene))
+    for path, kind in zip(outputs.image_filenames, outputs.cameras.camera_type.flatten()):
+        number = int(path.stem[-1])
+        assert kind == (CameraType.FISHEYE if number % 3 else CameraType.PERSPECTIVE).value
+    assert read_scene(scene).mask(frames[2]["mask_path"]).is_file()
 
 
 @pytest.mark.parametrize(
