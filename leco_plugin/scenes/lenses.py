@@ -32,6 +32,10 @@ MIXED = {CameraType.PERSPECTIVE, CameraType.FISHEYE}
 FISHEYES = {CameraType.FISHEYE, CameraType.FISHEYE624}
 UNDISTORTED = {CameraType.PERSPECTIVE, *FISHEYES}
 """Types for whose rays nerfstudio undoes the distortion."""
+RENDERED_ONLY = ("OMNIDIRECTIONALSTEREO", "VR180")
+"""How names of types begin of which nerfstudio makes whole pictures and no batch of rays."""
+COEFFICIENTS_624 = 12
+"""Of a FISHEYE624: nerfstudio makes no ray of one that has others."""
 FAR_OUTSIDE = 4.0
 """Square of the normalised radius beyond which no image shows anything."""
 
@@ -81,6 +85,7 @@ def lens_of(meta: dict[str, Any], frame: dict[str, Any], where: str) -> Lens:
     (fx, angle_x), (fy, angle_y) = (_focal(meta, frame, axis, where) for axis in "xy")
     kind = _kind(meta | frame, where)
     distortion = _distortion(frame, kind, where) or _distortion(meta, kind, where)
+    _refuse_without_rays(kind, distortion, where)
     cx, cy = said("cx", positive=False), said("cy", positive=False)
     width, height = said("w"), said("h")
     given, full = "", math.inf if width is None else width
@@ -207,8 +212,9 @@ def _distortion(owner: dict[str, Any], kind: CameraType | None, where: str) -> l
             given = f"{where}: distortion_params is {str(listed)[:40]!r}"
             raise InputError(f"{given}: give a list of numbers")
         listed = [_number(value, "distortion_params", where) for value in listed]
-        wanted = "12 numbers" if kind is CameraType.FISHEYE624 else ", ".join(DISTORTIONS)
-        if len(listed) != (12 if kind is CameraType.FISHEYE624 else len(DISTORTIONS)):
+        is_624 = kind is CameraType.FISHEYE624
+        wanted = f"{COEFFICIENTS_624} numbers" if is_624 else ", ".join(DISTORTIONS)
+        if len(listed) != (COEFFICIENTS_624 if is_624 else len(DISTORTIONS)):
             raise InputError(f"{where}: distortion_params has {len(listed)} numbers: give {wanted}")
         if any(values) and values != listed:
             raise InputError(f"{where}: distortion_params and k1.. differ: remove one")
@@ -219,6 +225,20 @@ def _distortion(owner: dict[str, Any], kind: CameraType | None, where: str) -> l
         fault = f"nerfstudio cannot undo the distortion of {kind.name}"
         raise InputError(f"{where}: {fault}: set it to 0, or undistort")
     return values
+
+
+def _refuse_without_rays(
+    kind: CameraType | None, distortion: list[float] | None, where: str
+) -> None:
+    """InputError for a lens of which nerfstudio makes no batch of rays."""
+    if kind is not None and kind.name.startswith(RENDERED_ONLY):
+        remedy = "cut the photographs into perspective ones, and give their camera_model"
+        raise InputError(
+            f"{where}: nerfstudio renders with a {kind.name}, it cannot train: {remedy}"
+        )
+    if kind is CameraType.FISHEYE624 and len(distortion or ()) != COEFFICIENTS_624:
+        fault = f"a {kind.name} has {COEFFICIENTS_624} numbers of distortion_params"
+        raise InputError(f"{where}: {fault}: give them, zeros where it has fewer")
 
 
 def _refuse_other_lenses(owner: dict[str, Any], where: str) -> None:

@@ -9,10 +9,18 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, Cameras, CameraType
+from nerfstudio.model_components.ray_generators import RayGenerator
 from scene_files import refused
 
-from leco_plugin.scenes.lenses import UNDISTORTED, bend, check_together, lens_of, set_lenses
+from leco_plugin.scenes.lenses import (
+    RENDERED_ONLY,
+    UNDISTORTED,
+    bend,
+    check_together,
+    lens_of,
+    set_lenses,
+)
 from leco_plugin.scenes.scene_file import unused_fields
 
 SCENE: dict[str, Any] = {
@@ -109,6 +117,8 @@ def test_a_fisheye_of_instant_ngp_is_one() -> None:
         ({"distortion_params": None}, "distortion_params is 'None'"),
         ({"distortion_params": [0.0, float("inf")]}, "distortion_params is 'inf'"),
         ({"camera_model": "FISHEYE624", "k1": 0.1, "distortion_params": [0] * 6}, "12 numbers"),
+        ({"camera_model": "FISHEYE624", "k1": 0.1}, "has 12 numbers of distortion_params: give"),
+        ({"camera_model": "VR180_L"}, "cannot train: cut the photographs into perspective ones"),
         ({"distortion_params": [0.1] * 12}, "has 12 numbers: give k1"),
         ({"camera_model": ["OPENCV"]}, "is none of"),
         ({"fl_x": 0.0}, "fl_x is '0.0'.*give a positive number"),
@@ -172,6 +182,25 @@ def test_distortion_is_refused_where_nerfstudio_drops_it() -> None:
     for model in ("ORTHOPHOTO", "VR180_L", "OMNIDIRECTIONALSTEREO_R"):
         with refused(f"cannot undo the distortion of {model}"):
             lens_of({"camera_model": model}, {"k1": 0.1}, "here")
+
+
+def test_lenses_of_which_nerfstudio_makes_no_batch_of_rays_are_refused() -> None:
+    pixels = torch.tensor([[2, 5, 7], [0, 1, 30], [1, 9, 2], [2, 2, 2]])
+    for model, kind in CAMERA_MODEL_TO_TYPE.items():
+        said: dict[str, Any] = {"camera_model": model}
+        said |= {"distortion_params": [0.0] * 12} if model == "FISHEYE624" else {}
+        lens = torch.tensor(said["distortion_params"]).expand(3, -1) if len(said) > 1 else None
+        cameras = Cameras(
+            *(torch.eye(3, 4).expand(3, -1, -1), 30.0, 30.0, 16.0, 12.0, 32, 24, lens, kind)
+        )
+        if kind.name.startswith(RENDERED_ONLY):
+            with pytest.raises((IndexError, RuntimeError)):
+                RayGenerator(cameras)(pixels)
+            with refused("cannot train"):
+                lens_of(said, {}, "here")
+        else:
+            assert RayGenerator(cameras)(pixels).directions.shape == (4, 3)
+            assert lens_of(said, {}, "here").kind is kind
 
 
 def test_fisheyes_show_one_circle() -> None:
