@@ -239,5 +239,5 @@ def told_by(scene: SceneFile, data: Path, outputs: Any) -> dict[str, Any]:
         metres = meta["metres_per_unit"]
         if type(metres) not in (int, float) or not 0.0 < metres < float("inf"):
             raise InputError(f"{data}: metres_per_unit is {metres!r}, not a positive number")
-        told[METRES_PER_UNIT] = applied_scale * float(metres)
+        told[METRES_PER_UNIT] = float(metres)
     return told

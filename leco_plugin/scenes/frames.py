@@ -182,8 +182,9 @@ def units_of(datamanager: Any, metres_per_unit: float | None = None) -> DatasetU
     scale = float(getattr(outputs, "dataparser_scale", 0.0))
     if outputs is None or not 0.0 < scale < math.inf:
         return None
-    read = (outputs.metadata or {}).get(METRES_PER_UNIT)
-    known = read if metres_per_unit is None else metres_per_unit
+    metadata = outputs.metadata or {}
+    _, applied_scale = metadata.get(APPLIED, (None, 1.0))  # a part of the scale, and of the poses
+    known = metadata.get(METRES_PER_UNIT) if metres_per_unit is None else metres_per_unit
     if known is not None and not 0.0 < float(known) < math.inf:
         raise InputError(f"a unit of the dataset is a positive number of metres, not {known}")
     metres = 1.0 if known is None else float(known)
@@ -193,7 +194,7 @@ def units_of(datamanager: Any, metres_per_unit: float | None = None) -> DatasetU
     if float(up[near].abs()) > UPRIGHT:
         up = torch.zeros_like(up).index_fill_(0, near, up[near].sign())
     zero = metres * float(up @ inverse(frame)[:, 3])
-    return DatasetUnits(metres / scale, zero, known is not None)
+    return DatasetUnits(metres * applied_scale / scale, zero, known is not None)
 
 
 SKEW = 0.05

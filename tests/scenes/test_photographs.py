@@ -26,6 +26,7 @@ from leco_plugin.scenes.frames import (
     inverse,
     moved,
     parsed_frame,
+    units_of,
 )
 from leco_plugin.scenes.photographs import (
     LecoPhotographsDataParserConfig,
@@ -345,6 +346,18 @@ def test_a_scene_may_say_how_many_metres_a_unit_of_its_poses_is(scene: Path) -> 
         change(scene, lambda meta, wrong=wrong: meta.update(metres_per_unit=wrong))
         with refused("metres_per_unit"):
             outputs_of(scene)
+
+
+def test_units_are_those_of_the_poses_whatever_scale_was_applied_to_these(scene: Path) -> None:
+    def found(by_hand: float | None = None, **said: float) -> Any:
+        change(scene, lambda meta: meta.update(metres_per_unit=None) or meta.update(said))
+        return units_of(SimpleNamespace(train_dataparser_outputs=outputs_of(scene)), by_hand)
+
+    bare, metric = found(), found(metres_per_unit=3.0)
+    assert metric.per_scene_unit == pytest.approx(3.0 * bare.per_scene_unit)
+    assert found(applied_scale=4.0) == bare
+    assert found(applied_scale=4.0, metres_per_unit=3.0) == metric
+    assert found(by_hand=3.0, applied_scale=4.0) == metric
 
 
 def test_scenes_are_told_apart_by_what_is_in_them(tiny_scene: Path, tmp_path: Path) -> None:
