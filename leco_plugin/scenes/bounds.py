@@ -122,12 +122,14 @@ def find_bounds(
 
 
 def usable_points(points: Tensor | None) -> Tensor | None:
-    """The finite ones of points [P, 3], float32 on the CPU; None of fewer than `FEWEST_POINTS`."""
+    """The finite ones of points [P, 3], float32 on the CPU; None of fewer than `FEWEST_POINTS`, and
+    of those that all lie at one place, as a writer's zeros do."""
     if points is None:
         return None
     points = points.detach().float().cpu()
     points = points[points.isfinite().all(dim=-1)]
-    return points if len(points) >= FEWEST_POINTS else None
+    is_cloud = len(points) >= FEWEST_POINTS and bool((points != points[0]).any())
+    return points if is_cloud else None
 
 
 def _without_strays(points: Tensor, poses: Tensor | None) -> tuple[Tensor, str]:

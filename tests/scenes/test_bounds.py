@@ -267,7 +267,10 @@ def test_bounds_grow_with_the_scene() -> None:
     assert ten.far == pytest.approx(10.0 * one.far, rel=1e-3)
 
 
-@pytest.mark.parametrize("points", [None, torch.zeros(3, 3), torch.full((99, 3), float("nan"))])
+@pytest.mark.parametrize(
+    "points",
+    [None, torch.zeros(3, 3), torch.full((99, 3), float("nan")), torch.full((70, 3), 0.3)],
+)
 def test_without_points_the_cameras_bound_the_scene(points) -> None:
     poses, directions, _ = around()
     poses[:, :, 3] = poses[:, :, 3] * torch.tensor([1.0, 2.0, 0.5]) + torch.tensor([3.0, 1.0, 2.0])
