@@ -168,7 +168,7 @@ def _load(builder: Callable[..., nn.Module] | str) -> Callable[..., nn.Module]:
     module, _, attribute = builder.partition(":")
     try:
         made: Callable[..., nn.Module] = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, TypeError) as error:  # the last of names that begin with .
         raise ValueError(f"{builder} cannot be imported: {error}") from None
     return made
 

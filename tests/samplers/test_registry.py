@@ -105,6 +105,7 @@ class TakesMore(torch.nn.Module):
         (dict, {"whatever": 2}, None),  # nobody knows what a compiled class takes
         ("nowhere.at_all:build", {}, r"nowhere\.at_all:build cannot be imported: No module named"),
         ("math:build", {}, "math:build cannot be imported: module 'math' has no attribute 'build'"),
+        ("./mine.py:build", {}, r"^\./mine\.py:build cannot be imported: .*relative import"),
     ],
 )
 def test_builders_of_any_kind_are_asked_what_they_take(builder, options, said, monkeypatch):
