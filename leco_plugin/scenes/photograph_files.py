@@ -251,7 +251,7 @@ class DerivedImages:
         """The file with what `make` makes of `source`; `recipe` names it. InputError as `put`."""
         status = source.stat()
         known_by = f"{source.resolve()} {status.st_size} {status.st_mtime_ns} {recipe}"
-        digest = hashlib.blake2b(known_by.encode(), digest_size=8).hexdigest()
+        digest = hashlib.blake2b(os.fsencode(known_by), digest_size=8).hexdigest()
         path = self.folder / f"{source.stem[-LONGEST:]}-{digest}.png"
         if not path.exists():
             self.put(path, make())
@@ -339,7 +339,7 @@ def _values(path: Path) -> NDArray[np.uint8]:
             if image.mode[0] in "IF":
                 deep = np.nan_to_num(np.asarray(image, dtype=np.float64)).clip(min=0.0)
                 return np.ceil(deep * (255.0 / max(deep.max(), 1e-9))).astype(np.uint8)
-            rgba = np.asarray(image.convert("RGBA")).astype(np.int16)
+            rgba = np.asarray(image.convert("RGBA")).astype(np.int32)
     except Exception as error:  # noqa: BLE001  decoders raise whatever they meet
         why = f"({one_line(error, 120)}): is the file whole?"
         raise InputError(f"the mask {path} cannot be read as an image {why}") from None

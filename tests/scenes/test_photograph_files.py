@@ -291,6 +291,12 @@ def test_a_source_with_the_longest_name_that_there_is_has_a_picture(tmp_path: Pa
     assert path.is_file()
 
 
+def test_a_source_whose_name_is_not_of_utf_8_has_a_picture(tmp_path: Path) -> None:
+    source = write(tmp_path / os.fsdecode(b"caf\xe9.png"), "RGB")
+    path = DerivedImages(tmp_path / "cache").get(source, "copy", lambda: decode(source, turn=False))
+    assert path.is_file()
+
+
 def test_a_place_that_cannot_be_written_is_named_with_the_remedy(source: Path) -> None:
     with refused(r"cannot be written .*--cache"):
         DerivedImages(source / "cache").get(source, "copy", lambda: decode(source, turn=False))

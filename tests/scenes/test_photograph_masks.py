@@ -150,6 +150,12 @@ def test_greys_from_the_middle_on_are_seen_where_there_are_so_light_ones(
     assert read(tmp_path / "a.png", (4, 1)).tolist() == [[bool(each) for each in seen]]
 
 
+def test_greys_beside_an_opacity_are_those_of_a_mask_without_one(tmp_path: Path) -> None:
+    greys = np.arange(100, 160, dtype=np.uint8)[None]
+    Image.fromarray(greys).convert("LA").save(tmp_path / "a.png")
+    assert (read(tmp_path / "a.png", (60, 1)) == (greys >= 128)).all()
+
+
 @pytest.mark.parametrize(("difference", "is_grey"), [(40, True), (41, False)])
 def test_a_little_colour_is_left_by_jpeg(difference: int, is_grey: bool, tmp_path: Path) -> None:
     pixels = np.full((2, 3, 3), 200, np.uint8)
