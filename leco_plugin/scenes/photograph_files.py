@@ -60,6 +60,8 @@ class Header(NamedTuple):
     """Whether it holds more pictures than one and a preview."""
     format: str
     """Pillow's name of the kind of file, whatever its name ends in."""
+    tipped: bool = False
+    """Whether it is a TIFF that Pillow lays on its side: by its path some are read wrongly."""
 
 
 @contextmanager
@@ -80,7 +82,9 @@ def header_of(path: Path, turned: bool = True) -> Header:
             several = image.format != "MPO" and getattr(image, "n_frames", 1) > 1
             transparent = image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info
             size, how = _size_and_orientation(image) if turned else (image.size, 1)
-            return Header(size, image.mode, transparent, how, several, image.format or "")
+            kind = image.format or ""
+            tipped = kind == "TIFF" and _orientation(image) >= 5
+            return Header(size, image.mode, transparent, how, several, kind, tipped)
     except Image.DecompressionBombError:
         most = f"{2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f} megapixels that Pillow opens"
         raise InputError(f"{path} has more than the {most}: make it smaller") from None
@@ -190,7 +194,8 @@ def check_kind(path: Path, header: Header) -> None:
 
 def is_plain(header: Header) -> bool:
     """Whether nerfstudio reads all colours of an image as they are."""
-    return header.mode in READ_RIGHTLY and header.transparent == (header.mode == "RGBA")
+    is_read = header.mode in READ_RIGHTLY and not header.tipped
+    return is_read and header.transparent == (header.mode == "RGBA")
 
 
 def plain(image: Image.Image) -> Image.Image:
@@ -292,7 +297,7 @@ def convert_masks(
                 grey.append(path)
             fitting = _fit(seen, size, path)
             header = header_of(path)
-            is_grey = header.mode == "L" and not header.transparent
+            is_grey = header.mode == "L" and is_plain(header)
             as_it_is = fitting is seen and bool((seen == (values > 0)).all()) and is_grey
             made = partial(Image.fromarray, fitting.astype(np.uint8) * 255)
             found.append(path if as_it_is else derived.get(path, f"mask {size}", made))
@@ -333,7 +338,8 @@ def _found(path: Path, image: Path) -> Path:
 def _values(path: Path) -> NDArray[np.uint8]:
     """How light a mask is: [H, W], 0 to 255, 0 if transparent. InputError for none, or colours."""
     try:
-        with Image.open(path) as image:
+        with opened(path) as image:
+            image.load()  # which sets a TIFF upright
             if image.mode in ("1", "L") and "transparency" not in image.info:
                 return np.asarray(image.convert("L"))
             if image.mode[0] in "IF":

@@ -283,7 +283,8 @@ def _plain_pictures(
             if is_plain(header) and not turn:
                 paths.append(path)
                 continue
-            converted["turned as EXIF says" if turn else f"of mode {header.mode}"] += 1
+            is_turned = turn or header.tipped
+            converted["turned as EXIF says" if is_turned else f"of mode {header.mode}"] += 1
             paths.append(derived.get(path, f"plain {turn}", partial(decode, path, turn)))
             progress(len(paths) / len(images))
     transparent = [path for path, header in zip(images, headers) if header.transparent]

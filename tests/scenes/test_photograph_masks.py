@@ -71,6 +71,15 @@ def test_the_same_pixels_are_seen(way: str, tmp_path: Path) -> None:
     assert (tmp_path / "cache").exists() is (way not in ("grey", "of 0 and 1"))
 
 
+@pytest.mark.parametrize("mode", ["L", "RGBA"])
+def test_a_mask_that_lies_on_its_side_is_set_upright(mode: str, tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x112] = 6
+    turned = WHITE.transpose(Image.Transpose.ROTATE_90).convert(mode)
+    turned.save(tmp_path / "a.tif", exif=exif)
+    np.testing.assert_array_equal(read(tmp_path / "a.tif"), SEEN)
+
+
 def test_a_smaller_mask_is_made_of_the_one_of_full_size(tmp_path: Path) -> None:
     for place in ("masks", "masks_3/of_one"):
         (tmp_path / place).mkdir(parents=True)
