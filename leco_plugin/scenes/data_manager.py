@@ -20,10 +20,15 @@ from torch import Tensor
 
 from leco_plugin.log import by_number, counted, say
 from leco_plugin.models.compute.device import free_memory
-from leco_plugin.scenes.frames import UP_IS_KNOWN, turn_outputs, turn_to_upright
+from leco_plugin.scenes.frames import SAME_PLACE, UP_IS_KNOWN, turn_outputs, turn_to_upright
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photograph_files import names_what_it_cannot_read
-from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler, Lattice, lattice_for
+from leco_plugin.scenes.pixels.held_out_pixels import (
+    HeldOutPixelSampler,
+    Lattice,
+    held_out_sampler,
+    lattice_for,
+)
 from leco_plugin.scenes.pixels.stored_pictures import picture_sizes, store_pictures
 from leco_plugin.scenes.reading import read_checked
 from leco_plugin.scenes.survey import CAMERAS, points_in
@@ -54,9 +59,55 @@ class LecoDataManagerConfig(VanillaDataManagerConfig):
 
 
 class LecoDataManager(Vanilla):  # type: ignore[type-arg]
-    """As nerfstudio's, but for where the photographs are, and what is up."""
+    """As nerfstudio's, but for where the photographs are, and what is up.
+
+    Attributes:
+        begun_with: of the run that is gone on with, what `get_extra_state` gave; None without one.
+    """
 
     config: LecoDataManagerConfig
+    begun_with: dict[str, Any] | None = None
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Travels with a checkpoint: where photographs were taken [P, 3], their height and width
+        [P, 2], and the period of the lattice of held-out pixels, None without one."""
+        dataset, sampler = self.train_dataset, held_out_sampler(self)
+        return {
+            "places": dataset.cameras.camera_to_worlds[:, :3, 3].float().cpu(),
+            "resolutions": picture_sizes(dataset).cpu(),
+            "held_out_period": None if sampler is None else sampler.lattice.period,
+        }
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Notes it, for `refuse_others`: a run that is only looked at may be of other data."""
+        self.begun_with = state
+
+    def refuse_others(self) -> None:
+        """InputError if photographs lie elsewhere than in the run that is gone on with, are read in
+        other sizes, or other pixels of them are held out: it has trained on those."""
+        now, before = self.get_extra_state(), self.begun_with
+        if before is None:  # of an earlier checkpoint nothing is known
+            return
+        places, earlier = now["places"], before["places"]
+        same_number = len(places) == len(earlier)  # a host may be given more of them
+        atol = SAME_PLACE * float((earlier.amax(dim=0) - earlier.amin(dim=0)).max())
+        if same_number and not torch.allclose(places, earlier, atol=atol):
+            raise InputError(
+                "the photographs lie elsewhere in the scene than when the run was begun: give the "
+                "dataparser the options that it had, or begin a new run"
+            )
+        if same_number and not torch.equal(now["resolutions"], before["resolutions"]):
+            height, width = before["resolutions"].amax(dim=0).tolist()
+            raise InputError(
+                f"the run was begun with photographs of up to {width} x {height}, and they have "
+                "other sizes now: give the downscale factor that it had, or begin a new run"
+            )
+        period, its_own = now["held_out_period"], before["held_out_period"]
+        if period != its_own:
+            raise InputError(
+                f"--pipeline.datamanager.held-out-period is {period}, and the run that is gone on "
+                f"with has {its_own}: give that, or begin a new run"
+            )
 
     @property
     def dataparser(self) -> Any:

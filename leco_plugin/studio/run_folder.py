@@ -128,16 +128,16 @@ def keep_sizes(config: Any, model: Any, asked: Any) -> Any:
 
 def check_photographs(pipeline: Any) -> None:
     """InputError if a run that is gone on with has more or fewer photographs than it was begun
-    with: their codes would go to others."""
-    model: Any = getattr(pipeline, "model", None)
-    if not _has_mixture(model):
-        return
-    now = len(pipeline.datamanager.train_dataset)
-    if model.num_train_data != now:
+    with: their codes would go to others; or as `LecoDataManager.refuse_others`."""
+    model, manager = getattr(pipeline, "model", None), getattr(pipeline, "datamanager", None)
+    now = len(manager.train_dataset) if _has_mixture(model) else 0
+    if now and model.num_train_data != now:
         raise InputError(
             f"the run was begun with {counted(model.num_train_data, 'training photograph')}, and "
             f"the scene has {now}: put the same ones there, or begin a new run"
         )
+    if hasattr(manager, "refuse_others"):
+        manager.refuse_others()
 
 
 def _has_mixture(model: Any) -> bool:

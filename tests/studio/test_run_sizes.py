@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import shutil
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -160,6 +161,27 @@ def test_other_sizes_or_photographs_are_refused(begun: Any, scene: Path, poorer:
     config.pipeline.model = replace(model, sizes=with_size(model.sizes, table, 5))
     with pytest.raises(InputError, match=r"log2-table is 5, and the run .* leave it out"):
         config.setup(local_rank=0, world_size=1).setup()
+
+
+@pytest.mark.parametrize(
+    ("part", "option", "value", "said"),
+    [
+        ("datamanager", "held_out_period", 9, "held-out-period is 9, and the run .* has 5: give"),
+        ("datamanager", "camera_res_scale_factor", 0.5, "photographs of up to 32 x 32"),
+        ("datamanager", "upright", False, None),
+        ("dataparser", "scale_factor", 2.0, "lie elsewhere .* give the dataparser the options"),
+        ("dataparser", "center_method", "focus", "lie elsewhere"),
+    ],
+)
+def test_other_places_or_held_out_pixels_are_refused(
+    begun: Any, scene: Path, part: str, option: str, value: Any, said: str | None
+) -> None:
+    config = resumed(begun, scene, "moved")
+    manager = config.pipeline.datamanager
+    setattr(manager if part == "datamanager" else manager.dataparser, option, value)
+    trainer = config.setup(local_rank=0, world_size=1)
+    with pytest.raises(InputError, match=said) if said else nullcontext():
+        trainer.setup()
 
 
 def test_no_image_is_decoded_to_choose_sizes(
