@@ -25,7 +25,7 @@ from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.objective import field_losses, gate_losses
 from leco_plugin.models.rendering import Intervals, Rays, Routing, Shaded
 from leco_plugin.models.sizing.scene_sizes import complete
-from leco_plugin.scenes.input_error import state_of_this_version
+from leco_plugin.scenes.input_error import InputError, state_of_this_version
 from leco_plugin.scenes.learning_data import LearningData
 from leco_plugin.scenes.pixels.known_distances import DISTANCE
 from leco_plugin.scenes.survey import places_of
@@ -40,6 +40,7 @@ class LecoModel(DrawnInViewer, Model):
     Attributes:
         mixture: gate, field and region.
         progress: how far its run has come.
+        vouching: how many photographs taught the gate nothing so far; None before its run begins.
         plan: what the next training step does.
         kept_per_ray: mean kept samples per ray in the last batch, backdrop excluded; 1 while
             nothing is skipped.
@@ -66,6 +67,7 @@ class LecoModel(DrawnInViewer, Model):
         # nerfstudio's name for it: photographs with alpha are blended over black
         self.renderer_rgb = RGBRenderer(background_color="random")
         self.progress = Progress()
+        self.vouching: int | None = None
         self.plan = StepPlan(0, True, 0.0, None, annealed(losses, self.progress, 0))
         self.kept_per_ray = 1.0
         self.register_load_state_dict_post_hook(lambda model, _: model._keep_sizes())
@@ -112,7 +114,21 @@ class LecoModel(DrawnInViewer, Model):
         if bool(self.mixture.region.known):
             self.mixture.region.refuse_others(*asked)
         data = LearningData(manager, *asked)
+        if not self.mixture.is_frozen:
+            self._note_vouching(data)
         return Learner(self.mixture, data, run, config, self.progress)
+
+    def _note_vouching(self, data: LearningData) -> None:
+        """Notes how many photographs vouch. InputError if others would than before the run was
+        resumed: they have taught its gate."""
+        freezes = self.config.schedule.freeze and not self.config.homogeneous
+        asked, before = self.config.calibration.cameras if freezes else 0, self.vouching
+        self.vouching = len(data.vouching(asked))
+        if before is not None and self.vouching not in (0, before):
+            raise InputError(
+                f"--pipeline.model.calibration.cameras is {asked}, and of the run that is gone on "
+                f"with {before} photographs vouch: give that, or begin a new run"
+            )
 
     def leco_drawn(self) -> Drawn | None:
         """See `DrawnInViewer`."""
@@ -231,12 +247,13 @@ class LecoModel(DrawnInViewer, Model):
 
     def get_extra_state(self) -> dict[str, Any]:
         """How far the run has come travels with a checkpoint, as plain values."""
-        return {"progress": self.progress.to_dict()}
+        return {"progress": self.progress.to_dict(), "vouching": self.vouching}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restores what `get_extra_state` gave. InputError if it is of another version."""
         with state_of_this_version():
             self.progress = Progress.from_dict(state["progress"])
+        self.vouching = state.get("vouching")  # which earlier checkpoints do not say
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         """As torch's. InputError if the checkpoint is of an earlier version of this package."""

@@ -184,6 +184,17 @@ def test_other_places_or_held_out_pixels_are_refused(
         trainer.setup()
 
 
+def test_photographs_that_have_taught_a_gate_do_not_vouch_for_it(begun: Any, scene: Path) -> None:
+    config = resumed(begun, scene, "vouching")  # of a run that never sets any aside
+    model = config.pipeline.model
+    for cameras in (0, 1):
+        model.schedule, model.calibration = ScheduleConfig(), CalibrationConfig(cameras=cameras)
+        trainer = config.setup(local_rank=0, world_size=1)
+        refused = pytest.raises(InputError, match=r"calibration.cameras is 1, and .* 0 photographs")
+        with refused if cameras else nullcontext():
+            trainer.setup()
+
+
 def test_no_image_is_decoded_to_choose_sizes(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
