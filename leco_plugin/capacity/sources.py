@@ -24,7 +24,11 @@ from leco_plugin.models.rendering import Rays
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.frames import between, found_again, frame_of, moved, turned
 from leco_plugin.scenes.input_error import InputError, one_line, require_folder
-from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler, some_images
+from leco_plugin.scenes.pixels.held_out_pixels import (
+    held_out_sampler,
+    some_images,
+    visible_in_tests,
+)
 from leco_plugin.scenes.pixels.known_distances import batches_of
 from leco_plugin.studio.checkpoints import step_of, whole_of
 
@@ -191,7 +195,8 @@ def move_between_cameras(source: Source, seen: Seen, seed: int) -> Seen:
 
 
 def draw_test_rays(source: Source, occupancy: Occupancy, count: int) -> Seen | None:
-    """Rays of about `count` pixels of up to 16 test photographs; None where there are none."""
+    """Rays of about `count` pixels of up to 16 test photographs, less those that a lens or mask
+    hides; None where there are none."""
     dataset = source.manager.eval_dataset
     if dataset is None or len(dataset) == 0:
         return None
@@ -199,12 +204,16 @@ def draw_test_rays(source: Source, occupancy: Occupancy, count: int) -> Seen | N
     generator = torch.Generator().manual_seed(4)
     each = -(-count // len(images["image"]))
     indices, truths = [], []
-    for number, image in zip(images["image_idx"].tolist(), images["image"]):
+    for place, (number, image) in enumerate(zip(images["image_idx"].tolist(), images["image"])):
         sizes = torch.tensor(image.shape[:2])
         pixels = (torch.rand(each, 2, generator=generator) * sizes).long()
-        indices.append(torch.cat([torch.full((each, 1), number), pixels], dim=1))
+        of_batch = torch.nn.functional.pad(pixels, (1, 0), value=place)
+        pixels = pixels[visible_in_tests(source.manager, images, of_batch)]
+        indices.append(torch.nn.functional.pad(pixels, (1, 0), value=number))
         truths.append(image[tuple(pixels.T)])
     numbers, places = torch.cat(indices).split([1, 2], dim=1)
+    if len(numbers) == 0:
+        return None
     bundle = dataset.cameras.to("cpu").generate_rays(
         camera_indices=numbers, coords=places.float() + 0.5
     )

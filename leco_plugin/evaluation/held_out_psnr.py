@@ -16,7 +16,7 @@ from leco_plugin.learning.dense import evaluating
 from leco_plugin.learning.quality import doubts_of_field, psnr_of_one_colour
 from leco_plugin.log import note
 from leco_plugin.scenes.learning_data import held_out_bundle
-from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler
+from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler, visible_in_tests
 from leco_plugin.studio.host_models import true_colours
 
 FIRST_AFTER, BETWEEN = 8.0, 10.0
@@ -119,8 +119,8 @@ class HeldOutPsnr:
         return "" if self.latest is None else f"{self.latest:.1f} dB {OF}"
 
     def look_at_tests(self) -> float | None:
-        """PSNR, dB, on pixels of up to `TEST_PHOTOGRAPHS` test photographs; None without any. From
-        now on `of_one_colour` is of these pixels.
+        """PSNR, dB, on pixels of up to `TEST_PHOTOGRAPHS` test photographs that no lens or mask
+        hides; None without any. From now on `of_one_colour` is of these pixels.
 
         They are new views: a field can be good on photographs that it was trained on and fail here.
         """
@@ -131,12 +131,18 @@ class HeldOutPsnr:
         generator, cameras = torch.Generator().manual_seed(0), dataset.cameras.to("cpu")
         found: list[tuple[RayBundle, Tensor]] = []
         for number in chosen:
-            image = dataset.get_data(number)["image"]
+            data = dataset.get_data(number)
+            image = data["image"]
             places = torch.rand(FEWEST_LAST // len(chosen), 2, generator=generator)
             pixels = (places * torch.tensor(image.shape[:2])).long()
-            rays = cameras.generate_rays(camera_indices=number, coords=pixels + 0.5)
-            found.append((rays, image[tuple(pixels.T)]))
-        return self._psnr_of(found)
+            alone = {key: [data[key]] for key in ("image", "mask") if key in data}
+            alone["image_idx"] = torch.tensor([number])
+            of_batch = torch.nn.functional.pad(pixels, (1, 0))
+            pixels = pixels[visible_in_tests(self.manager, alone, of_batch)]
+            if len(pixels) > 0:
+                rays = cameras.generate_rays(camera_indices=number, coords=pixels + 0.5)
+                found.append((rays, image[tuple(pixels.T)]))
+        return self._psnr_of(found) if found else None
 
     def doubts(self, reached: float | None) -> list[str]:
         """Two lines where a PSNR is hardly above that of one colour for all of its pixels."""

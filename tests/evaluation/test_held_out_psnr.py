@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from nerfstudio.data.pixel_samplers import PixelSampler, PixelSamplerConfig
 from torch import nn
 
 from leco_plugin.evaluation import held_out_psnr
@@ -123,6 +124,39 @@ def test_at_the_end_test_photographs_are_looked_at() -> None:
     assert host.asked == [0, 1, 3, 4, 5, 6, 8, 9]
     assert host.training and psnr.of_one_colour == pytest.approx(10.6, abs=0.3)
     assert HeldOutPsnr(host, SimpleNamespace(train_dataset=host)).look_at_tests() is None
+
+
+class Hiding(OneColour):
+    """The same, white but for four pixels in the middle; masks show those, and none of the first
+    photograph."""
+
+    def __init__(self, masked: bool) -> None:
+        super().__init__()
+        self.masked = masked
+
+    def get_data(self, number: int) -> dict[str, torch.Tensor]:
+        mask = torch.zeros(5, 4, 1, dtype=torch.bool)
+        mask[1:3, 1:3] = True
+        image = torch.where(mask, super().get_data(number)["image"], 1.0)
+        return {"image": image} | ({"mask": mask & (number > 0)} if self.masked else {})
+
+    def generate_rays(self, camera_indices: int, coords: torch.Tensor) -> torch.Tensor:
+        return torch.full((len(coords), 3), camera_indices / 10)
+
+
+@pytest.mark.parametrize(("masked", "radius", "ordinary"), [(True, None, 6), (False, 1.5, 7)])
+def test_what_masks_and_lenses_hide_of_test_photographs_does_not_count(
+    masked: bool, radius: float | None, ordinary: int
+) -> None:
+    host = Hiding(masked)
+    manager = SimpleNamespace(
+        eval_dataset=host,
+        train_dataset=None,
+        eval_pixel_sampler=PixelSampler(PixelSamplerConfig(fisheye_crop_radius=radius)),
+    )
+    error = (ordinary * 0.2**2 + 0.1**2) / (ordinary + 1)
+    found = HeldOutPsnr(host, manager).look_at_tests()
+    assert found == pytest.approx(-10.0 * math.log10(error), abs=0.2)
 
 
 def test_drawing_pixels_is_part_of_the_time_spent(monkeypatch: pytest.MonkeyPatch) -> None:

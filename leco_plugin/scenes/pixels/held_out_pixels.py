@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any, Literal
 
 import torch
-from nerfstudio.data.pixel_samplers import PixelSampler
+from nerfstudio.data.pixel_samplers import PixelSampler, PixelSamplerConfig
 from torch import Tensor
 
 from leco_plugin.on_cpu import on_cpu
@@ -382,6 +382,14 @@ def _pixels_at(images: dict[str, Any], places: Tensor) -> dict[str, Tensor]:
         "image": look_up(images["image"], places[:, 0], places[:, 1:]),
         "indices": torch.cat([numbers[places[:, :1]], places[:, 1:]], dim=-1),
     }
+
+
+def visible_in_tests(manager: Any, images: dict[str, Any], places: Tensor) -> Tensor:
+    """`HeldOutPixelSampler.visible` in a batch of test photographs of any data manager."""
+    sampler = getattr(manager, "eval_pixel_sampler", None)
+    if not isinstance(sampler, HeldOutPixelSampler):
+        sampler = HeldOutPixelSampler(getattr(sampler, "config", PixelSamplerConfig()))
+    return sampler.visible(images, places)
 
 
 def held_out_sampler(datamanager: Any) -> HeldOutPixelSampler | None:
