@@ -17,6 +17,7 @@ from torch import Tensor
 
 from leco_plugin.evaluation.inspection import cameras_of
 from leco_plugin.learning.freezing import field_at_freezing
+from leco_plugin.learning.run import CONFIG
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.region import cut_rays
@@ -32,7 +33,6 @@ from leco_plugin.scenes.pixels.held_out_pixels import (
 from leco_plugin.scenes.pixels.known_distances import batches_of
 from leco_plugin.studio.checkpoints import step_of, whole_of
 
-CONFIG, CHECKPOINTS = "config.yml", "nerfstudio_models"
 DRAWS = 8
 """Most batches that are drawn to find enough different pixels."""
 
@@ -71,7 +71,7 @@ def find_source(file: Path, data: Path) -> Source:
     """
     require_folder(data, "give that of the scene with --data")
     folder = file.resolve().parent
-    is_run = (folder / CONFIG).is_file() and any((folder / CHECKPOINTS).glob("step-*.ckpt"))
+    is_run = (folder / CONFIG).is_file() and any(folder.rglob("step-*.ckpt"))
     if is_run and (source := _load_run(folder, data.resolve())) is not None:
         return source
     from leco_plugin.method_configs import best_device, leco_occupancy
@@ -82,7 +82,8 @@ def find_source(file: Path, data: Path) -> Source:
 
 
 def _load_run(folder: Path, data: Path) -> Source | None:
-    """The run's photographs and model; None for the run of a host, whose field is another one."""
+    """The run's photographs and model; None for one that has saved nothing, and for the run of a
+    host, whose field is another one."""
     import yaml
     from nerfstudio.utils.eval_utils import eval_load_checkpoint
 
@@ -96,7 +97,10 @@ def _load_run(folder: Path, data: Path) -> Source | None:
         raise InputError(f"{folder / CONFIG} cannot be read: {one_line(error, 200)}") from None
     if not (isinstance(built, type) and issubclass(built, LecoModel)):
         return None
-    path = whole_of(folder / CHECKPOINTS)
+    checkpoints = folder / config.relative_model_dir
+    if not any(checkpoints.glob("step-*.ckpt")):
+        return None
+    path = whole_of(checkpoints)
     config.load_dir, config.load_step = path.parent, step_of(path)
     config.data = config.pipeline.datamanager.data = data
     try:

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 
 from leco_plugin.learning.calibration import Measured
+from leco_plugin.learning.run import folder_of
 from leco_plugin.log import note, say
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.occupancy import Occupancy
@@ -95,8 +96,7 @@ def leave_field(mixture: Mixture, folder: Path | None) -> None:
 def carry_over(resumed_from: Path, folder: Path) -> None:
     """Copies the state into the folder of a run that resumes another one, given by a checkpoint or
     its folder of checkpoints, if that has left any."""
-    checkpoints = resumed_from if resumed_from.is_dir() else resumed_from.parent
-    left = checkpoints.parent / FIELD_FILE
+    left = folder_of(resumed_from) / FIELD_FILE
     if not left.is_file() or (folder / FIELD_FILE).exists():
         return
     try:

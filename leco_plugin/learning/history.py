@@ -11,6 +11,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from leco_plugin.learning.run import folder_of
 from leco_plugin.log import say
 from leco_plugin.models.compute.ranks import share
 from leco_plugin.models.gate import Gate, GateConfig, check_sizes
@@ -111,9 +112,8 @@ class GateHistory:
     def load_before(cls, checkpoint: Path, step: int, gate: Gate) -> GateHistory:
         """The looks of a run, given by a checkpoint or its folder of checkpoints, before the step
         at which it resumes; none if it stored none of this gate."""
-        checkpoints = checkpoint if checkpoint.is_dir() else checkpoint.parent
         try:
-            found = cls.load(checkpoints.parent / FILE_NAME, gate)
+            found = cls.load(folder_of(checkpoint) / FILE_NAME, gate)
         except (OSError, ValueError):
             return cls()
         looks = sum(look < step for look in found.steps)

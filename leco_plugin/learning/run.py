@@ -18,6 +18,18 @@ PACE = "leco_pace"
 """Attribute of an optimizer: the multiple of its learning rates that it steps with."""
 
 
+CONFIG = "config.yml"
+"""In the folder of each run of nerfstudio."""
+
+
+def folder_of(checkpoint: Path) -> Path:
+    """The folder of a run, given by a checkpoint or its folder of checkpoints: the nearest one
+    above with a config, else the next one."""
+    checkpoints = checkpoint if checkpoint.is_dir() else checkpoint.parent
+    above = checkpoints.absolute().parents
+    return next((folder for folder in above if (folder / CONFIG).is_file()), checkpoints.parent)
+
+
 class Run(Protocol):
     """A training run. `LearningOnly` is one without a trainer."""
 

@@ -164,12 +164,13 @@ def checkpoints_of(config: Any) -> Path:
     named, path = Path(config.load_dir), config_in_use()
     if path is None:
         return named
-    beside = path.parent / named.name
+    relative = getattr(config, "relative_model_dir", named.name)
+    beside = path.parent / relative
     for folder in (beside, named):
         if any(list(each.glob("*.ckpt")) for each in (folder, previous_of(folder))):
             return folder
     raise InputError(
-        f"there is no checkpoint in {named}, nor in {beside}: put the folder {named.name} of this "
+        f"there is no checkpoint in {named}, nor in {beside}: put the folder {relative} of this "
         f"run beside {path}"
     )
 

@@ -22,7 +22,7 @@ from torch import nn
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
-from leco_plugin.learning.run import LearningOnly, Run
+from leco_plugin.learning.run import CONFIG, LearningOnly, Run
 from leco_plugin.log import counted
 from leco_plugin.models.compute.ranks import is_first
 from leco_plugin.models.sizing.sizes import sizes_in, sizes_to_resume
@@ -75,9 +75,6 @@ def _release_all(process: int) -> None:
     if os.getpid() == process:
         for folder in list(_held):
             release(folder)
-
-
-CONFIG = "config.yml"
 
 
 def checkpoint_of(config: Any) -> Path | None:

@@ -13,7 +13,6 @@ from ball_occupancy import THEIR_MARCH, ball_of_the_tiny_scene
 
 from leco_plugin.capacity.references import AT_FREEZING, BY_DECISIONS, NOW, measure_shares_lost
 from leco_plugin.capacity.sources import (
-    CHECKPOINTS,
     CONFIG,
     Source,
     check_scene,
@@ -38,8 +37,8 @@ def test_a_guided_run_has_no_model_to_ask(tiny_scene: Path, tmp_path: Path) -> N
     config.data = config.pipeline.datamanager.data = tiny_scene
     config.save_config()
     folder = config.get_base_dir()
-    (folder / CHECKPOINTS).mkdir()
-    (folder / CHECKPOINTS / "step-000000001.ckpt").touch()
+    (folder / "nerfstudio_models").mkdir()
+    (folder / "nerfstudio_models" / "step-000000001.ckpt").touch()
     source = find_source(folder / "occupancy.safetensors", tiny_scene)
     assert source.model is None and len(source.manager.train_dataset) == 7
 
@@ -47,8 +46,8 @@ def test_a_guided_run_has_no_model_to_ask(tiny_scene: Path, tmp_path: Path) -> N
 @pytest.mark.parametrize("text", ["", "one: [two", "!!python/name:no.such.module", "\ud800"])
 def test_a_damaged_config_is_named(tiny_scene: Path, tmp_path: Path, text: str) -> None:
     (tmp_path / CONFIG).write_bytes(text.encode(errors="surrogatepass"))
-    (tmp_path / CHECKPOINTS).mkdir()
-    (tmp_path / CHECKPOINTS / "step-000000001.ckpt").touch()
+    (tmp_path / "nerfstudio_models").mkdir()
+    (tmp_path / "nerfstudio_models" / "step-000000001.ckpt").touch()
     with pytest.raises(InputError, match=r"config.yml cannot be read"):
         find_source(tmp_path / "occupancy.safetensors", tiny_scene)
 

@@ -107,11 +107,15 @@ def test_a_damaged_or_foreign_field_is_refused(mixture: Mixture, tmp_path: Path)
 
 
 @pytest.mark.parametrize("what", ["checkpoint", "folder"])
-def test_a_resumed_run_takes_it_along(what: str, mixture: Mixture, tmp_path: Path) -> None:
+@pytest.mark.parametrize("models", ["nerfstudio_models", "models/of_this"])
+def test_a_resumed_run_takes_it_along(
+    what: str, models: str, mixture: Mixture, tmp_path: Path
+) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     leave_field(mixture, first)
-    checkpoint = first / "nerfstudio_models" / "step-000000009.ckpt"
-    checkpoint.parent.mkdir()
+    (first / "config.yml").touch()
+    checkpoint = first / models / "step-000000009.ckpt"
+    checkpoint.parent.mkdir(parents=True)
     checkpoint.write_bytes(b"")
     carry_over(checkpoint if what == "checkpoint" else checkpoint.parent, second)
     assert (second / FIELD_FILE).read_bytes() == (first / FIELD_FILE).read_bytes()

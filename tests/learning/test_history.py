@@ -51,13 +51,16 @@ def test_a_resumed_run_goes_on_with_the_looks_before_its_first_step(tmp_path: Pa
     gate = a_gate()
     history = a_history(gate)
     history.save(tmp_path)
-    folder = tmp_path / "nerfstudio_models"
-    folder.mkdir()
-    for checkpoint in (folder, folder / "step-000000015.ckpt"):
+    folder, nested = tmp_path / "nerfstudio_models", tmp_path / "models" / "of_this"
+    for models in (folder, nested):
+        models.mkdir(parents=True)
+    (tmp_path / "config.yml").touch()
+    for checkpoint in (folder, folder / "step-000000015.ckpt", nested):
         found = GateHistory.load_before(checkpoint, 16, gate)
         assert found.steps == [0, 10] and len(found.weights) == len(found.shares) == 2
         found.look(16, 1.0, gate, torch.tensor([0]), torch.tensor([0.0]))
         assert GateHistory.load(found.save(folder), gate).steps == [0, 10, 16]
+    (tmp_path / "config.yml").unlink()
     assert GateHistory.load_before(folder, 10, gate).steps == [0]  # step 10 is made again
     assert len(GateHistory.load_before(folder, 16, a_gate(width=12))) == 0
     assert len(GateHistory.load_before(tmp_path / "a" / "b" / "none.ckpt", 16, gate)) == 0

@@ -11,6 +11,7 @@ import pytest
 from nerfstudio.utils import eval_utils, writer
 from tiny_run import tiny_trainer
 
+from leco_plugin.capacity.sources import find_source
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.studio.checkpoints import config_in_use, found_around
@@ -45,6 +46,22 @@ def test_a_run_is_found_beside_its_config_and_its_data_where_they_lay(
     assert step == 7 and checkpoint.parent == config_of(project).parent / "nerfstudio_models"
     assert pipeline.datamanager.get_datapath() == project / "data" / "scene"
     assert "data/scene is not there;" in printed()
+
+
+def test_checkpoints_in_folders_of_folders_are_found_beside_it(trained: Path) -> None:
+    config = config_of(trained)
+    text = config.read_text()
+    config.write_text(text.replace("- nerfstudio_models\n", "- models/of_this\n"))
+    nested = config.parent / "models" / "of_this"
+    nested.parent.mkdir()
+    (config.parent / "nerfstudio_models").rename(nested)
+    try:
+        assert eval_utils.eval_setup(config)[2].parent == nested
+        source = find_source(config.parent / "occupancy.safetensors", trained / "data" / "scene")
+        assert source.model is not None
+    finally:
+        nested.rename(config.parent / "nerfstudio_models")
+        config.write_text(text)
 
 
 @pytest.mark.parametrize("linked", [False, True])
