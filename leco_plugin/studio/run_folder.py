@@ -56,6 +56,7 @@ def claim(folder: Path, checkpoints: Path, load_from: Path | None) -> str | None
             atexit.register(_release_all, os.getpid())
         _held[place] = held
     theirs = [path for path in checkpoints.glob("*.ckpt") if step_of(path) >= 0]
+    theirs += folder.glob("*.safetensors")  # also of a run that saved no checkpoint
     source = None if load_from is None else load_from.resolve()
     if theirs and (source is None or checkpoints.resolve() not in (source, source.parent)):
         release(folder)

@@ -125,6 +125,13 @@ def test_a_new_run_does_not_take_a_folder_with_checkpoints(folder: Path) -> None
     assert claim(folder, checkpoints, left) is None
 
 
+def test_a_new_run_does_not_take_the_occupancy_of_one_that_saved_nothing(folder: Path) -> None:
+    folder.mkdir()
+    (folder / "occupancy.safetensors").touch()
+    assert "holds an earlier run" in (claim(folder, folder / "checkpoints", None) or "")
+    assert claim(folder, folder / "checkpoints", folder / "checkpoints") is None
+
+
 def test_a_config_goes_to_a_folder_of_its_own_and_says_so(tmp_path: Path, printed: Any) -> None:
     def config():
         made = copy.deepcopy(leco_occupancy.config)
