@@ -1,7 +1,8 @@
-"""Small values on a device that the CPU decides by, read without waiting for it each time."""
+"""What a device leaves to the CPU: small values that decide, and sums where it has no float64."""
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
@@ -22,3 +23,13 @@ def on_cpu(tensor: Tensor) -> Tensor:
         known = _known[tensor] = tensor._version, tensor.cpu()
     values: Tensor = known[1]
     return values
+
+
+def has_float64(device: torch.device) -> bool:
+    """Whether a device computes in float64; Apple's GPUs do not."""
+    return device.type != "mps"
+
+
+def in_float64(tensor: Tensor) -> Tensor:
+    """A tensor in float64, on the CPU where its device has none."""
+    return tensor.double() if has_float64(tensor.device) else tensor.cpu().double()

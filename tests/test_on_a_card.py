@@ -33,6 +33,10 @@ def test_the_cpu_knows_what_it_decides_by_however_that_was_written() -> None:
     assert run("reading").split() == ["known"] * 6
 
 
+def test_what_skipping_costs_is_measured_on_a_card_without_float64() -> None:
+    assert run("without_float64") == "measured\n"
+
+
 @pytest.fixture(scope="module")
 def method(tmp_path_factory: pytest.TempPathFactory) -> str:
     """What is said of the method's whole life on a card."""

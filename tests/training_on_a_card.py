@@ -1,4 +1,5 @@
-"""python training_on_a_card.py refusals | sampling | reading, or leco-occupancy | hosts FOLDER."""
+"""python training_on_a_card.py refusals | sampling | reading | without_float64, or
+leco-occupancy | hosts FOLDER."""
 
 from __future__ import annotations
 
@@ -8,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 import tiny_scene
@@ -16,17 +18,27 @@ import tyro
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.registry import discover_methods
-from pretended_card import CARD, pretended_card, waits
+from pretended_card import CARD, OnCard, pretended_card, waits
 from small_hosts import NERFACTO, NGP, QUICK, RAYS, SWITCH_NERF, sizes
+from small_learner import NoPixels, small_mixture
 from tiny_run import tiny_config
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
+from leco_plugin import on_cpu
 from leco_plugin.conformance.scene import SLAB, crossing
+from leco_plugin.learning.calibration import CalibrationConfig
+from leco_plugin.learning.held_out import HeldOut
+from leco_plugin.learning.price_watch import Evidence
+from leco_plugin.learning.quality import kept_of_seen
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import GateConfig
 from leco_plugin.models.mixture import Mixture
-from leco_plugin.models.rendering import Routing
+from leco_plugin.models.rendering import Rays, Routing
 from leco_plugin.models.sizing.sizes import Sizes
+from leco_plugin.samplers import scan
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+from leco_plugin.scenes.frames import inverse
 
 HOSTS = {
     "leco-ngp": [
@@ -106,6 +118,49 @@ def reading() -> None:
     claim(lambda of: of.load_state_dict(before))
     with torch.inference_mode():
         claim(lambda of: of.cones.fill_(0.125))
+
+
+class NoFloat64(TorchDispatchMode):
+    """Refuses float64 on the card, as Apple's GPUs do."""
+
+    def __torch_dispatch__(
+        self, function: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
+        out = function(*args, **(kwargs or {}))
+        if isinstance(out, OnCard) and out.dtype == torch.float64:
+            raise TypeError(f"{function}: the card has no float64")
+        return out
+
+
+class WhitePixels(NoPixels):
+    """Nine rays, and white pixels."""
+
+    def held_out(self, mixture: Mixture, *_: Any) -> tuple[Rays, Tensor]:
+        origins, directions = (
+            part.to(CARD) for part in (self.survey.origins, self.survey.directions)
+        )
+        images = torch.zeros(9, dtype=torch.int64, device=CARD)
+        return mixture.rays(origins, directions, images), torch.ones(9, 3, device=CARD)
+
+
+def without_float64() -> None:
+    """What is measured at freezing and after it, on a card without float64."""
+    data: Any = WhitePixels()
+    mixture = small_mixture().to(CARD)
+    held_out = HeldOut(mixture, data, CalibrationConfig(), restarted=False)
+    with (
+        NoFloat64(),
+        patch.object(on_cpu, "has_float64", lambda device: device.type == "cpu"),
+        patch.object(scan, "has_float64", lambda device: device.type == "cpu"),
+    ):
+        measured, report = held_out.price()
+        mixture.freeze(measured.threshold, report)
+        for values in held_out.excesses(0).values():
+            Evidence().with_rays(values, 9.0)
+        held_out.unneeded(9, 0.1)
+        kept_of_seen(mixture)
+        inverse(torch.eye(3, 4, device=CARD))
+    print("measured")
 
 
 def waits_by_step(trainer: Any) -> dict[int, list[str]]:
@@ -202,7 +257,9 @@ def main() -> None:
     what, *folder = sys.argv[1:]
     with pretended_card():
         if not folder:
-            {"refusals": refusals, "sampling": sampling, "reading": reading}[what]()
+            for program in (refusals, sampling, reading, without_float64):
+                if program.__name__ == what:
+                    program()
         elif what == "leco-occupancy":
             leco_occupancy(Path(folder[0]))
         else:

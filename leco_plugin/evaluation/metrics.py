@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor
 
+from leco_plugin.on_cpu import in_float64
+
 if TYPE_CHECKING:
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
@@ -52,7 +54,7 @@ def decibels(squared_error: float) -> float:
 
 def psnr(predicted: Tensor, truth: Tensor) -> float:
     """Peak signal-to-noise ratio in dB of colours in 0..1, both [H, W, 3]; at most 120 dB."""
-    return decibels(torch.mean((predicted - truth) ** 2, dtype=torch.float64).item())
+    return decibels(float(in_float64((predicted - truth) ** 2).mean()))
 
 
 def ssim(predicted: Tensor, truth: Tensor) -> float:

@@ -33,6 +33,7 @@ from leco_plugin.evaluation.queries import GridUpdates, count_queries
 from leco_plugin.evaluation.report import finite_or_null
 from leco_plugin.hosts.learn_first import FIRST_TIMED, TIMED_STEPS, keep_within
 from leco_plugin.learning.schedule import rate_at
+from leco_plugin.on_cpu import in_float64
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.studio.host_models import leave_out_the_end, true_colours
 
@@ -345,7 +346,7 @@ def errors_on_rays(trainer: Trainer, rays: int) -> list[float]:
         bundle = cameras.generate_rays(camera_indices=number, coords=coords).to(pipeline.device)
         rgb = render_rays(pipeline.model, bundle, RAYS_AT_ONCE)
         truth = true_colours(pipeline.model, image[rows, columns].to(rgb.device))
-        errors.append(float(((rgb - truth) ** 2).mean(dtype=torch.float64)))
+        errors.append(float(in_float64((rgb - truth) ** 2).mean()))
     pipeline.train()
     return errors
 

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from leco_plugin.learning.dense import DenseRendering, Reference
 from leco_plugin.occupancy import CAMERAS_THAT_VOUCH
+from leco_plugin.on_cpu import in_float64
 from leco_plugin.samplers.packed import accumulate_along_rays
 from leco_plugin.scenes.input_error import require
 
@@ -244,7 +245,7 @@ def ray_prices(
             ray_indices,
             len(truth),
         )
-        found.append(torch.stack([*of_rays.unbind(dim=-1), dense_error, gated_error]).double())
+        found.append(in_float64(torch.stack([*of_rays.unbind(dim=-1), dense_error, gated_error])))
     together = torch.cat(found, dim=-1) if found else torch.zeros(6, 0)
     surface, lost_surface, lost, weight, dense_error, gated_error = together.unbind()
     return RayPrices(
@@ -288,8 +289,8 @@ def backdrop_price(rendering: DenseRendering) -> float:
     dense = without = floor = 0.0
     for i, (reference, truth) in enumerate(zip(rendering.references, rendering.truths)):
         rgb = rendering.render_kept(i, ~reference.always_kept)
-        dense += float((reference.rgb - truth).square().sum(dtype=torch.float64))
-        without += float((rgb - truth).square().sum(dtype=torch.float64))
+        dense += float(in_float64((reference.rgb - truth).square()).sum())
+        without += float(in_float64((rgb - truth).square()).sum())
         floor += EXACT * truth.numel()
     return price_db(without, dense, floor) if floor else 0.0
 
@@ -297,7 +298,7 @@ def backdrop_price(rendering: DenseRendering) -> float:
 def image_price(gated: Tensor, dense: Tensor, floor: float) -> tuple[float, float]:
     """By how many dB of PSNR an image is worse than the dense one, and the standard error of that,
     from squared errors [R] of the same rays; a sum of `floor` is as good as none."""
-    gated, dense = gated.double(), dense.double()
+    gated, dense = in_float64(gated), in_float64(dense)
     after, before = float(gated.sum()), float(dense.sum())
     apart = gated / (after + floor) - dense / (before + floor)
     error = 10.0 / math.log(10.0) * float(apart.square().sum().sqrt())

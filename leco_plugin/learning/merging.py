@@ -20,6 +20,7 @@ from leco_plugin.learning.calibration import EXACT, price_db
 from leco_plugin.learning.dense import evaluating, in_chunks, near_median_depth
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.rendering import Intervals, Rays
+from leco_plugin.on_cpu import in_float64
 from leco_plugin.scenes.input_error import require
 
 
@@ -104,9 +105,11 @@ def _surface_and_error(
     error, values = torch.zeros((), dtype=torch.float64), 0
     for (rays, intervals), truth in zip(kept, truths, strict=True):
         shaded = mixture.shade(rays, intervals)
-        on_surface = (shaded.weights * near_median_depth(shaded, intervals)).double()
-        mass += torch.bincount(shaded.routes, on_surface, minlength=len(mass)).cpu()
-        error += (shaded.rgb - truth).square().sum(dtype=torch.float64).cpu()
+        on_surface = in_float64(shaded.weights * near_median_depth(shaded, intervals))
+        mass += torch.bincount(
+            shaded.routes.to(on_surface.device), on_surface, minlength=len(mass)
+        ).cpu()
+        error += in_float64((shaded.rgb - truth).square()).sum().cpu()
         values += truth.numel()
     return mass / mass.sum().clamp(min=1e-12), error / max(values, 1)
 

@@ -18,6 +18,7 @@ from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.collapse import SUSPECTED_STEPS
 from leco_plugin.learning.run import WatchState
 from leco_plugin.models.compute.ranks import from_first, mean
+from leco_plugin.on_cpu import in_float64
 
 REMEMBERED = 0.8
 """How much the rays of a measurement count beside those of the next: the field goes on learning."""
@@ -39,7 +40,7 @@ class Evidence(NamedTuple):
     def with_rays(self, values: Tensor, most: float) -> Evidence:
         """With the excesses [R] over a bound of one more measurement; those that are not finite are
         no evidence. `most` rays there are: measured again and again they are no more evidence."""
-        values = values[values.isfinite()].double()
+        values = in_float64(values[values.isfinite()])
         new = (float(len(values)), float(values.sum()), float(values.square().sum()))
         sums = [REMEMBERED * old + more for old, more in zip(self, new)]
         share = min(1.0, most / max(sums[0], 1e-9))

@@ -12,6 +12,7 @@ from leco_plugin.evaluation.metrics import psnr
 from leco_plugin.learning.calibration import in_decibels
 from leco_plugin.log import by_number, counted
 from leco_plugin.occupancy import CAMERAS_THAT_VOUCH
+from leco_plugin.on_cpu import in_float64
 
 if TYPE_CHECKING:
     from leco_plugin.models.mixture import Mixture
@@ -46,7 +47,7 @@ def kept_of_seen(mixture: Mixture) -> float:
     if len(mapped) == 0:
         return 0.0
     kept = mixture.occupancies(mapped) >= mixture.threshold
-    return float(kept.double().mean())
+    return float(in_float64(kept).mean())
 
 
 def price_in_words(report: dict[str, Any]) -> list[str]:

@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from leco_plugin.on_cpu import has_float64
+
 
 class Segments(NamedTuple):
     """Which samples of a flat tensor belong to which ray; samples of a ray are contiguous."""
@@ -132,11 +134,7 @@ def _padded_scan(values: Tensor, rays: Segments, exclusive: bool, reverse: bool)
 def _scan_dtype(values: Tensor) -> torch.dtype:
     if not values.is_floating_point():
         return torch.int64
-    return torch.float64 if _has_float64(values.device) else torch.float32
-
-
-def _has_float64(device: torch.device) -> bool:
-    return device.type != "mps"
+    return torch.float64 if has_float64(values.device) else torch.float32
 
 
 class _PackedSum(torch.autograd.Function):

@@ -18,6 +18,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from numpy.typing import NDArray
 from torch import Tensor
 
+from leco_plugin.on_cpu import in_float64
 from leco_plugin.scenes.bounds import FEWEST_POINTS
 from leco_plugin.scenes.input_error import InputError
 
@@ -118,8 +119,9 @@ def between(host: list[list[float]], other: list[list[float]]) -> Tensor:
 
 def inverse(frame: Tensor) -> Tensor:
     """The frame [3, 4] that takes positions back."""
-    turn = torch.linalg.inv(frame[:, :3].double())
-    return torch.cat([turn, -turn @ frame[:, 3:].double()], dim=1).to(frame)
+    exact = in_float64(frame)
+    turn = torch.linalg.inv(exact[:, :3])
+    return torch.cat([turn, -turn @ exact[:, 3:]], dim=1).to(frame)
 
 
 def turned(directions: Tensor, frame: Tensor) -> Tensor:
