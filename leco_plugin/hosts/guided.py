@@ -35,6 +35,7 @@ from leco_plugin.models.compute.device import keep_freed_memory
 from leco_plugin.models.losses import require_finite
 from leco_plugin.samplers.nerfacc_cpu import install_for
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.pixels.known_distances import refuse_odd_batches
 from leco_plugin.scenes.survey import places_of
 from leco_plugin.studio.checkpoints import prepare_checkpoints
 from leco_plugin.studio.hash_encoding import speed_up_hash_encodings
@@ -142,8 +143,10 @@ class GuidedHost(DrawnInViewer, Host):
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
         """As the host's. Before its first step there is an occupancy, in its coordinates and in its
-        folder; what skipping costs is watched after each."""
+        folder; what skipping costs is watched after each. InputError for batches that cannot be
+        drawn."""
         attributes, guide = training_callback_attributes, self.leco_guide
+        refuse_odd_batches(getattr(attributes.pipeline, "datamanager", None))
         if not guide.needs_occupancy:
             return super().get_training_callbacks(attributes)
         config, around = self.leco_occupancy, (attributes.pipeline, run_of(attributes.trainer))

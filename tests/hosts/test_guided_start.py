@@ -13,6 +13,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from nerfstudio.model_components.ray_samplers import UniformSampler
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
@@ -297,6 +298,18 @@ def test_a_host_that_asks_no_gate_needs_no_occupancy(tiny_scene: Path) -> None:
     attributes = TrainingCallbackAttributes(None, None, pipeline, None)  # type: ignore[arg-type]
     pipeline.get_training_callbacks(attributes)
     assert pipeline.model.leco_guide.occupancy is None
+
+
+def test_batches_that_nobody_can_draw_are_refused_before_anything_is_learned(
+    tiny_scene: Path,
+) -> None:
+    pipeline = leco_ngp_with(OccupancyConfig(), tiny_scene)
+    manager = pipeline.datamanager
+    manager.train_pixel_sampler = PixelSamplerConfig(num_rays_per_batch=45).setup()
+    manager.train_dataset.cameras.height[0] += 1
+    attributes = TrainingCallbackAttributes(None, None, pipeline, None)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="give 46"):
+        pipeline.get_training_callbacks(attributes)
 
 
 def test_with_a_file_nothing_is_said_of_bounds_for_learning_one(

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from leco_plugin.on_cpu import on_cpu
 from leco_plugin.scenes.bounds import FEWEST_POINTS
-from leco_plugin.scenes.input_error import require
+from leco_plugin.scenes.input_error import InputError, require
 from leco_plugin.scenes.lenses import bend
 from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler, Lattice, look_up
 from leco_plugin.scenes.pixels.stored_pictures import picture_sizes
@@ -125,14 +125,31 @@ def sampler_here(datamanager: Any) -> Any:
     return getattr(datamanager, "train_pixel_sampler", None)
 
 
+def _draws_even_numbers(sampler: Any, dataset: Any) -> bool:
+    """Whether a sampler draws even numbers of rays alone: nerfstudio's own, from photographs of
+    several sizes."""
+    if sampler is None or isinstance(sampler, HeldOutPixelSampler):
+        return False
+    return len(picture_sizes(dataset).unique(dim=0)) > 1
+
+
 def drawable(rays: int, manager: Any) -> int:
-    """So many rays, or one more where nerfstudio's own sampler draws from photographs of several
-    sizes: it draws even numbers alone."""
+    """So many rays, or one more where the sampler of training batches draws even numbers alone."""
     sampler = getattr(manager, "train_pixel_sampler", None)
-    if rays % 2 == 0 or sampler is None or isinstance(sampler, HeldOutPixelSampler):
-        return rays
-    sizes = picture_sizes(manager.train_dataset)
-    return rays if bool((sizes == sizes[0]).all()) else rays + 1
+    is_odd = rays % 2 == 1 and _draws_even_numbers(sampler, manager.train_dataset)
+    return rays + 1 if is_odd else rays
+
+
+def refuse_odd_batches(manager: Any) -> None:
+    """InputError for batches that nerfstudio's own samplers could not draw."""
+    for which in ("train", "eval"):
+        sampler = getattr(manager, f"{which}_pixel_sampler", None)
+        rays = getattr(sampler, "num_rays_per_batch", 0)
+        if rays % 2 == 1 and _draws_even_numbers(sampler, getattr(manager, f"{which}_dataset")):
+            raise InputError(
+                f"--pipeline.datamanager.{which}-num-rays-per-batch is {rays}, and nerfstudio draws"
+                f" even numbers alone from photographs of several sizes: give {rays + 1}"
+            )
 
 
 @contextmanager

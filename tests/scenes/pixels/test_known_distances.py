@@ -13,6 +13,7 @@ from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from scene_files import refused
 
 from leco_plugin.scenes.bounds import FEWEST_POINTS
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.pixels.held_out_pixels import Lattice
 from leco_plugin.scenes.pixels.known_distances import (
     DISTANCE,
@@ -21,6 +22,7 @@ from leco_plugin.scenes.pixels.known_distances import (
     SparsePixels,
     batches_of,
     hidden,
+    refuse_odd_batches,
     sparse_pixels,
 )
 
@@ -207,6 +209,11 @@ def test_nerfstudios_sampler_can_draw_any_batch_of_pictures_of_many_sizes() -> N
     dataset.cameras.height[1] += 3
     with batches_of(45, manager):
         assert len(plain.sample(batch)["indices"]) == 46
+    plain.set_num_rays_per_batch(45)
+    with pytest.raises(InputError, match=r"train-num-rays-per-batch is 45, .* give 46$"):
+        refuse_odd_batches(manager)
+    plain.set_num_rays_per_batch(44)
+    refuse_odd_batches(manager)
     with batches_of(44, manager):
         assert len(plain.sample(batch)["indices"]) == 44
     manager.train_pixel_sampler = sampler()
