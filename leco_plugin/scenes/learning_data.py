@@ -117,8 +117,7 @@ class LearningData:
         """Whether batches are drawn here, and of all pictures at once."""
         if not isinstance(sampler_here(self.manager), HeldOutPixelSampler):
             return False
-        pictures = _images_of(self.manager)["image"]
-        return not isinstance(pictures, list) and len(pictures) == photographs
+        return len(_images_of(self.manager)["image"]) == photographs
 
     def of_vouching(self, mixture: Mixture, count: int, of_each: int) -> list[tuple[Rays, Tensor]]:
         """Rays of each photograph that vouches, and their colours; see `held_out_rays`."""

@@ -72,10 +72,24 @@ def test_for_one_draw_of_rays_they_are_set_aside(
     assert aside == [[5, 15, 25, 35]] and sampler.set_aside is None
 
 
-@pytest.mark.parametrize("images", [[torch.zeros(6, 7, 3)] * 40, torch.zeros(16, 6, 7, 3)])
+@pytest.mark.parametrize("images", [[torch.zeros(6, 7, 3)] * 16, torch.zeros(16, 6, 7, 3)])
 def test_partial_batches_set_no_pictures_aside(data: LearningData, images: Any) -> None:
     data.manager.images["image"] = images
     assert len(data.vouching(4)) == 0
+
+
+def test_pictures_of_several_sizes_vouch_too(data: LearningData) -> None:
+    pictures = [torch.full((6 + number % 3, 7, 3), float(number)) for number in range(40)]
+    data.manager.images["image"], sampler = pictures, data.manager.train_pixel_sampler
+    data.prepare_batch(40.0, distances=False, set_aside=4)
+    batch = sampler.sample(dict(data.manager.images))
+    assert sampler.set_aside is not None and len(batch["indices"]) == 2000
+    counts = batch["indices"][:, 0].bincount(minlength=40)
+    assert counts[[5, 15, 25, 35]].tolist() == [0] * 4
+    assert counts[counts > 0].unique().tolist() == [55, 56]
+    assert torch.equal(batch["image"][:, 0], batch["indices"][:, 0].float())
+    found = sampler.sample_pictures(dict(data.manager.images), data.vouching(4), 20, seed=0)
+    assert found["image"][:, 0].tolist() == [5.0] * 20 + [15.0] * 20 + [25.0] * 20 + [35.0] * 20
 
 
 SAID = {"count": 9, "worst_surface_mass": 0.00123, "bound": 0.002, "confidence": 0.9}

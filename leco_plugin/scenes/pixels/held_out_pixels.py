@@ -214,7 +214,7 @@ class HeldOutPixelSampler(PixelSampler):
     def collate_image_dataset_batch_list(
         self, batch: dict[str, Any], num_rays_per_batch: int, keep_full_image: bool = False
     ) -> dict[str, Any]:
-        """A batch of pictures of several sizes, lists of [H, W, C], with equal shares of all.
+        """A batch of pictures of several sizes, lists of [H, W, C]: equal shares of those drawn.
 
         nerfstudio's own wants an even number of rays, never draws of some of many pictures, and
         sorts its rays by pictures.
@@ -222,9 +222,12 @@ class HeldOutPixelSampler(PixelSampler):
         pictures, masks, numbers = batch["image"], batch.get("mask"), self.numbers
         on_sphere = self.config.is_equirectangular and masks is None
         draw = self.sample_method_equirectangular if on_sphere else self.sample_method
-        share, rest = divmod(num_rays_per_batch, len(pictures))
-        counts = torch.full((len(pictures),), share)
-        counts[torch.randperm(len(pictures))[:rest]] += 1
+        drawn = torch.arange(len(pictures))
+        if self.set_aside is not None:
+            drawn = drawn[~self.set_aside[numbers]]
+        share, rest = divmod(num_rays_per_batch, len(drawn))
+        counts = torch.zeros_like(numbers).index_fill_(0, drawn, share)
+        counts[drawn[torch.randperm(len(drawn))[:rest]]] += 1
         chosen = counts.nonzero()[:, 0]
         self.numbers, found = numbers[chosen], []
         for number in chosen.tolist():
@@ -237,9 +240,8 @@ class HeldOutPixelSampler(PixelSampler):
             for key, source in batch.items()
             if key not in ("image_idx", "mask") and source is not None
         }
-        whole = {"full_image": pictures} if keep_full_image else {}
-        indices = torch.cat([numbers[places[:, :1]], places[:, 1:]], dim=-1)
-        return {**values, "indices": indices, **whole}
+        values |= {"full_image": pictures} if keep_full_image else {}
+        return values | {"indices": torch.cat([numbers[places[:, :1]], places[:, 1:]], dim=-1)}
 
     def shown(self, pixels: Tensor, sizes: Tensor, numbers: Tensor | None = None) -> Tensor:
         """Whether a fisheye shows pixels (image, row, column) [N, 3]: bool [N]. Sizes (height,
