@@ -135,7 +135,7 @@ class HeldOutPsnr:
             image = data["image"]
             places = torch.rand(FEWEST_LAST // len(chosen), 2, generator=generator)
             pixels = (places * torch.tensor(image.shape[:2])).long()
-            alone = {key: [data[key]] for key in ("image", "mask") if key in data}
+            alone: dict[str, Any] = {key: [data[key]] for key in ("image", "mask") if key in data}
             alone["image_idx"] = torch.tensor([number])
             of_batch = torch.nn.functional.pad(pixels, (1, 0))
             pixels = pixels[visible_in_tests(self.manager, alone, of_batch)]

@@ -127,7 +127,8 @@ def keep_sizes(config: Any, model: Any, asked: Any) -> Any:
 def check_photographs(pipeline: Any) -> None:
     """InputError if a run that is gone on with has more or fewer photographs than it was begun
     with: their codes would go to others; or as `LecoDataManager.refuse_others`."""
-    model, manager = getattr(pipeline, "model", None), getattr(pipeline, "datamanager", None)
+    model: Any = getattr(pipeline, "model", None)
+    manager: Any = getattr(pipeline, "datamanager", None)
     now = len(manager.train_dataset) if _has_mixture(model) else 0
     if now and model.num_train_data != now:
         raise InputError(
