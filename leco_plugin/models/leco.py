@@ -253,7 +253,7 @@ class LecoModel(DrawnInViewer, Model):
         """Restores what `get_extra_state` gave. InputError if it is of another version."""
         with state_of_this_version():
             self.progress = Progress.from_dict(state["progress"])
-        self.vouching = state.get("vouching")  # which earlier checkpoints do not say
+            self.vouching = state["vouching"]
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         """As torch's. InputError if the checkpoint is of an earlier version of this package."""
