@@ -20,7 +20,7 @@ from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
 from torch.nn.parallel import DistributedDataParallel
 
 from leco_plugin.log import say
-from leco_plugin.scenes.input_error import InputError, TrainingStopped
+from leco_plugin.scenes.input_error import InputError, TrainingStopped, require
 from leco_plugin.scenes.whole_files import writing_into
 from leco_plugin.studio.checkpoints import follow_data
 from leco_plugin.studio.run_folder import OUTPUT, claim
@@ -30,16 +30,13 @@ from leco_plugin.studio.trainer import AtomicTrainer
 LOST = ("Connection closed by peer", "Connection reset by peer", "NCCL communicator was aborted")
 """What gloo and NCCL say of a process that is gone."""
 
-AT_LEAST_ONE = (
-    *("pipeline.datamanager.train-num-rays-per-batch", "pipeline.model.eval-num-rays-per-chunk"),
-    *("pipeline.fewest-rays", "pipeline.most-rays"),
+COUNTS_OF_RAYS = (
+    "pipeline.datamanager.train_num_rays_per_batch",
+    "pipeline.model.eval_num_rays_per_chunk",
+    "pipeline.fewest_rays",
+    "pipeline.most_rays",
 )
-"""Options that count rays, of the methods that have them."""
-
-
-def part_of(config: Any, option: str) -> Any:
-    """An option of a part of a config, None where there is no such."""
-    return getattr(config, option.replace("-", "_"), None)
+"""Where a config counts rays, of the methods that do."""
 
 
 @dataclass
@@ -74,10 +71,12 @@ class DataParallelTrainerConfig(TrainerConfig):
             raise InputError(
                 f"--max-num-iterations is {self.max_num_iterations}; a run needs at least one step"
             )
-        for option in AT_LEAST_ONE:
-            number: Any = functools.reduce(part_of, option.split("."), self)
-            if number is not None and number < 1:
-                raise InputError(f"--{option} is {number}; it must be at least 1")
+        for place in COUNTS_OF_RAYS:
+            number: Any = self
+            for name in place.split("."):
+                number = getattr(number, name, None)
+            option = f"--{place.replace('_', '-')}"
+            require(number is None or number >= 1, option, number, "at least 1")
         named = {
             "data": self.data,
             "load-dir": self.load_dir,

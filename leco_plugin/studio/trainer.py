@@ -253,19 +253,18 @@ class AtomicTrainer(Trainer):
             return f"the last good checkpoint is {saved[-1]}"
         return "no checkpoint was saved yet"
 
+    @_misfits_in_one_line()
     def _load_checkpoint(self) -> None:
         """As nerfstudio's, from the newest checkpoint of a folder that is whole. InputError for
         none, and for one that is of another method or of other options."""
         config, folder = self.config, self.config.load_dir
         if folder is None or config.load_step is not None:
-            with _misfits_in_one_line():
-                super()._load_checkpoint()
+            super()._load_checkpoint()
             return
         path = whole_of(folder, "going on from {}")
         self.config = replace(config, load_dir=None, load_checkpoint=path)
         try:
-            with _misfits_in_one_line():
-                super()._load_checkpoint()
+            super()._load_checkpoint()
         finally:
             self.config = config
 
