@@ -19,6 +19,7 @@ from chart_sections import chart_sections, star, stored, suite_sections, titles
 from comparisons import comparison_section, comparisons
 from eight_questions import eight_answers, scenes_and_seeds
 from growth_picture import cities, growth_table
+from hue import hue_section
 from large_scene_tables import LARGE_SCENES
 from learning import sentence as learning_sentence
 from page_parts import (
@@ -308,6 +309,8 @@ def measurements_page() -> str:
         parts += learning_section(json.loads(learning.read_text()))
     if (sharpened := RESULTS / "sharpening.json").exists():
         parts += sharpening_sections(json.loads(sharpened.read_text()))
+    if (hues := RESULTS / "hue.json").exists():
+        parts += hue_section(json.loads(hues.read_text()))
     parts += promises_section(json.loads((RESULTS / "promises.json").read_text()))
     if (profiled := RESULTS / "profile.json").exists():
         parts += profile_sections(json.loads(profiled.read_text()))
