@@ -92,8 +92,8 @@ def signature(case: EstimatorCase) -> None:
 
 @checks("shapes-types-devices", "estimator")
 def shapes_types_devices(case: EstimatorCase) -> None:
-    for device in samplers.devices():
-        sampler, rays = case.shared(SLAB).to(device), kit.crossing().to(device)
+    for device, count in itertools.product(samplers.devices(), kit.COUNTS):
+        sampler, rays = case.shared(SLAB).to(device), kit.crossing(count).to(device)
         for training in (False, True):
             given = rays.copied()
             samples = case.ask(sampler.train(training), given)
@@ -205,8 +205,11 @@ def _check_uniform(shares: Tensor) -> None:
 def zero_samples_well_formed(case: EstimatorCase) -> None:
     sampler = case.shared(SLAB)
     asked: list[dict[str, Any]] = [{}, {"sigma_fn": lambda t_starts, *_: torch.ones_like(t_starts)}]
+    empty = [(why, sampler, rays) for why, rays in kit.without_samples().items()]
+    if case.needs_occupancy:
+        empty.append((kit.KEEPS_NOTHING, case.shared(kit.NOTHING), kit.crossing()))
     for training in (False, True):
-        for why, rays in kit.without_samples().items():
+        for why, sampler, rays in empty:
             field = Field()
             sampler.train(training)
             for options in asked:
@@ -242,10 +245,11 @@ def skips_only_what_it_may(case: EstimatorCase) -> None:
             if case.needs_occupancy:
                 _check_skipped_is_not(rays, samples, scene)
             _check_kept_is_sampled(rays, samples, scene, step, training)
-    if case.needs_occupancy:  # the host's box is not where an unbounded scene ends
-        samples = case.sample(case.shared(kit.AROUND), kit.leaving())
-        _check_skipped_is_not(kit.leaving(), samples, kit.AROUND)
-        _check_kept_is_sampled(kit.leaving(), samples, kit.AROUND)
+        if case.needs_occupancy:  # the host's box is not where an unbounded scene ends
+            rays, sampler = kit.leaving(), case.shared(kit.AROUND).train(training)
+            samples = case.sample(sampler, rays)
+            _check_skipped_is_not(rays, samples, kit.AROUND)
+            _check_kept_is_sampled(rays, samples, kit.AROUND, shifted=training)
 
 
 def _check_skipped_is_not(rays: Rays, samples: Samples, scene: Slab) -> None:

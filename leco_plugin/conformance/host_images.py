@@ -162,7 +162,7 @@ def rendered(model: Model, rays: RayBundle, seed: int = 0) -> dict[str, Tensor]:
 def empty_rays_show_background(case: HostCase) -> None:
     for why, scene, away in (
         ("rays that miss the scene", SLAB, True),
-        ("an occupancy that keeps nothing", kit.NOTHING, False),
+        (kit.KEEPS_NOTHING, kit.NOTHING, False),
     ):
         model = case.shared(scene)
         outputs = rendered(model, hosts.bundle(away))
@@ -205,6 +205,7 @@ def shades_only_what_is_kept(case: HostCase) -> None:
         (True, False, SLAB),
         (False, True, SLAB),
         (False, False, kit.AROUND),
+        (True, False, kit.AROUND),
     ):
         model = case.shared(scene, moved).train(training)
         positions, sampled = asked_and_sampled(model)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from typing import Any
 
 import torch
@@ -131,8 +132,8 @@ def signature(case: ProposalCase) -> None:
 
 @checks("shapes-types-devices", "proposal")
 def shapes_types_devices(case: ProposalCase) -> None:
-    for device in samplers.devices():
-        sampler, rays = case.shared(SLAB).to(device), kit.crossing().to(device)
+    for device, count in itertools.product(samplers.devices(), kit.COUNTS):
+        sampler, rays = case.shared(SLAB).to(device), kit.crossing(count).to(device)
         given = rays.copied()
         ray_samples, weights, candidates = case.ask(sampler, ray_bundle(given))
         samplers.check_rays(given, rays)
@@ -203,6 +204,9 @@ def sorted_disjoint_inside(case: ProposalCase) -> None:
 def skips_only_what_it_may(case: ProposalCase) -> None:
     for training in (False, True):
         _check_gathered(case, case.shared(SLAB).train(training), kit.crossing())
+        if case.needs_occupancy:
+            around = case.shared(kit.AROUND).train(training)
+            _check_gathered(case, around, kit.leaving(), kit.AROUND)
     _check_gathered(case, case.shared(SLAB), kit.within())
     if case.needs_occupancy:
         try:
@@ -210,7 +214,6 @@ def skips_only_what_it_may(case: ProposalCase) -> None:
         except TypeError as error:
             raise Broken(f"no host in other coordinates can have it (frame=): {error}") from error
         _check_gathered(case, moved.eval(), kit.crossing())
-        _check_gathered(case, case.shared(kit.AROUND), kit.leaving(), kit.AROUND)
 
 
 def _check_gathered(case: ProposalCase, sampler: Any, rays: Rays, scene: Slab = SLAB) -> None:

@@ -35,6 +35,8 @@ STEP, LONG_STEP, SHORT_STEP = 0.05, 0.25, 0.0015
 some two thousand in the box."""
 MANY = 20_000
 """Rays of a batch as a host on a GPU has it: what goes wrong on few rays, or in pieces, shows."""
+COUNTS = 48, 1
+"""Rays of other batches: the last chunk of an image may hold a single one."""
 MARGIN = 0.08
 """World units. Deeper than this inside what is kept is plainly inside, farther off is plainly
 outside: wider than a cell of a grid of 128, and than what a rounding decides."""
@@ -181,8 +183,8 @@ TWO = Slab((0.48, 0.6, 0.64), 0.15, offset=0.4)
 """Two thin slabs, with a gap between them."""
 AROUND = Slab(SLAB.normal, 0.8, unbounded=True)
 """A slab that goes on beyond the box, without end."""
-NOTHING = Slab((0.0, 0.0, 1.0), -1.0)
-"""A scene in which all is empty."""
+NOTHING, KEEPS_NOTHING = Slab((0.0, 0.0, 1.0), -1.0), "an occupancy that keeps nothing"
+"""A scene in which all is empty, and what is said of its occupancy."""
 
 
 class Field(nn.Module):

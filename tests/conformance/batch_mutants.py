@@ -11,7 +11,7 @@ import torch
 from conformance.estimator_mutants import SKIPS, Answers, Sound
 from torch import Tensor
 
-from leco_plugin.conformance.scene import box
+from leco_plugin.conformance.scene import DISTANCE, box
 from leco_plugin.samplers.marching import Samples
 from leco_plugin.samplers.registry import SamplerSpec
 
@@ -169,6 +169,32 @@ class AtMostAThousand(Answers):
         return ray_indices[kept], t_starts[kept], t_ends[kept]
 
 
+class Squeezes(Sound):
+    """Takes a batch of one ray for a ray."""
+
+    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
+        return super().sampling(rays_o.squeeze(0), rays_d, *args, **options)
+
+
+class InTheBoxInTraining(Answers):
+    """Takes an unbounded scene to end where its contraction begins, while it learns."""
+
+    def change(self, ray_indices: Tensor, t_starts: Tensor, t_ends: Tensor) -> Samples:
+        kept = (t_starts < 2.0 * DISTANCE) | (not self.training)
+        return ray_indices[kept], t_starts[kept], t_ends[kept]
+
+
+class StandInWhereNothingIsKept(Sound):
+    """One sample for rays that meet the box, when there is none."""
+
+    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
+        samples = super().sampling(rays_o, rays_d, *args, **options)
+        met = self.occupancy.space.map(rays_o + DISTANCE * rays_d).abs().amax(dim=-1) < 1.0
+        if len(samples[0]) or not bool((met & (options["t_min"] < options["t_max"])).any()):
+            return samples
+        return torch.zeros(1, dtype=torch.int64), rays_o.new_zeros(1), rays_o.new_ones(1)
+
+
 class ShakenUnasked(Sound):
     """Shifts rays in training, though a host wants them where they are."""
 
@@ -188,6 +214,8 @@ class AsFirstAsked(Sound):
 
 
 MUTANTS: dict[str, tuple[type, ...]] = {
+    "shapes-types-devices": (Squeezes,),
+    "zero-samples-well-formed": (StandInWhereNothingIsKept,),
     "sorted-disjoint-inside": (
         ReversedOnce,
         WithoutNearPlaneInTraining,
@@ -198,7 +226,14 @@ MUTANTS: dict[str, tuple[type, ...]] = {
     "all-kept-equals-dense": (AtMostAThousand, ShakenUnasked),
     "state-dict-round-trip": (AsFirstAsked,),
     "stratified-in-training": (OneJitter, SharedByTwo, HalfAStep, NearerByPreference),
-    SKIPS: (PiecesOfTheFirst, ShortRunsDropped, FirstRunOnly, FromOutsideOnly, NotAlongAxes),
+    SKIPS: (
+        PiecesOfTheFirst,
+        ShortRunsDropped,
+        FirstRunOnly,
+        FromOutsideOnly,
+        NotAlongAxes,
+        InTheBoxInTraining,
+    ),
 }
 """By the rule that must fail."""
 

@@ -352,6 +352,8 @@ ALSO: dict[type, set[str]] = {
     Overlapping: {SKIPS, "all-kept-equals-dense", "stratified-in-training", "visibility-pruning"},
     ShakenOutOfBounds: {SKIPS, "sorted-disjoint-inside"},
     DropsTheFirst: {SKIPS, "visibility-pruning"},
+    KeepsAll: {"zero-samples-well-formed"},
+    KeepsAllInTraining: {"zero-samples-well-formed"},
 }
 """What else cannot hold for a mutant."""
 

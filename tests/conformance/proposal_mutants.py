@@ -177,6 +177,21 @@ class InTheBoxOnly(SoundProposal):
         return super().worth(positions) * inside
 
 
+class InTheBoxInTrainingProposal(InTheBoxOnly):
+    """Does so while it learns."""
+
+    def worth(self, positions: Tensor) -> Tensor:
+        return super().worth(positions) if self.training else SoundProposal.worth(self, positions)
+
+
+class SqueezesBundles(SoundProposal):
+    """Takes a bundle of one ray for a ray."""
+
+    def generate_ray_samples(self, ray_bundle: Any = None, density_fns: Any = None) -> Any:
+        samples, weights, candidates = super().generate_ray_samples(ray_bundle, density_fns)
+        return samples, [level.squeeze(0) for level in weights], candidates
+
+
 class FromOutsideOnlyProposal(SoundProposal):
     """Takes rays that begin in the box to miss it."""
 
@@ -271,6 +286,7 @@ PROPOSAL_MUTANTS: dict[str, tuple[type, ...]] = {
         OfOneCamera,
         OfNoTime,
         WithoutMetadata,
+        SqueezesBundles,
     ),
     "sorted-disjoint-inside": (LastFirst,),
     "deterministic-in-eval": (Shaking,),
@@ -283,6 +299,7 @@ PROPOSAL_MUTANTS: dict[str, tuple[type, ...]] = {
         ForgetsTheFrame,
         KnowsNoFrame,
         InTheBoxOnly,
+        InTheBoxInTrainingProposal,
     ),
     "all-kept-equals-dense": (PrefersTheFront,),
     "no-gradient-to-the-gate": (ProposalThaws, EdgesCarryAGraph),
