@@ -274,7 +274,7 @@ class RunOnImages(Run):
 
     def loss(self, step: int) -> Tensor:
         _, losses, _ = self.pipeline.get_train_loss_dict(step)
-        return torch.stack([loss.sum() for loss in losses.values()]).sum()
+        return functools.reduce(torch.add, losses.values())
 
     def files(self, split: str) -> set[Path]:
         """Images of the data manager's `train_dataset` or `eval_dataset`."""

@@ -117,13 +117,15 @@ class GuidedHost(DrawnInViewer, Host):
             guide.cropped = False
 
     def get_loss_dict(self, outputs: Any, batch: Any, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        """As the host's, without losses of proposal networks that are gone. FloatingPointError if a
-        loss is not finite; no step is taken with it."""
+        """As the host's, without losses that teach nothing, such as of proposal networks that are
+        gone. FloatingPointError if a loss is not finite; no step is taken with it."""
         losses = super().get_loss_dict(outputs, batch, *args, **kwargs)  # type: ignore[safe-super]
         if not self.training:
             return losses
         if self.leco_guide.without_proposals:
-            losses = {name: loss for name, loss in losses.items() if loss.requires_grad}
+            losses = {
+                name: loss for name, loss in losses.items() if torch.as_tensor(loss).requires_grad
+            }
         if losses:
             require_finite(losses, self, outputs, batch.get("image", torch.zeros(())))
         return losses
