@@ -133,7 +133,9 @@ def export(
 
     check_place("--json", json)
     file = occupancy_of(file)
-    check_apart({"--out": out, "--json": json}, file)
+    start = format == "splat-init" and out.suffix == ".json"
+    points = out.with_suffix(".ply") if start else None
+    check_apart({"--out": out, "the points of --out": points, "--json": json}, file)
     check_apart({"--json": json}, data)
     if format is not None:
         facts = made.export(file, format, out, resolution, levels, frame, data)

@@ -35,6 +35,7 @@ from leco_plugin.evaluation.occupancy_picture import draw
 from leco_plugin.export_surface import (
     CELLS,
     KeptSurface,
+    few_cells,
     finest,
     in_comments,
     kept_surface,
@@ -290,6 +291,8 @@ def export_folder(
         raise ValueError(f"--out {folder} is a file; without --format give a folder")
     check_place("--out", folder / "kept.ply")
     occupancy = Occupancy.load(file)
+    if resolution is not None:
+        few_cells(mapped_box(occupancy), resolution, "a surface")
     description = scene_of(occupancy, file, data)
     folder.mkdir(parents=True, exist_ok=True)
 

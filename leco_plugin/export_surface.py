@@ -84,7 +84,7 @@ def kept_surface(occupancy: Occupancy, resolution: int) -> KeptSurface:
             sees its surface.
     """
     box = mapped_box(occupancy)
-    counts = _few_cells(box, resolution, "a surface")
+    counts = few_cells(box, resolution, "a surface")
     axes = [box.axis(number, count) for number, count in enumerate(counts)]
     cells = math.prod(counts)
 
@@ -181,7 +181,7 @@ def require_few(cells: int, said: str) -> None:
         )
 
 
-def _few_cells(box: ViewBox, resolution: int, what: str) -> tuple[int, int, int]:
+def few_cells(box: ViewBox, resolution: int, what: str) -> tuple[int, int, int]:
     """Cells along each axis of a box, so many along its longest side. ValueError if `what` cannot
     have as few or as many."""
     if resolution < 2:
@@ -290,7 +290,7 @@ def write_volume(
     cube; `resolution` is the number of cells along the longest side.
     """
     box = whole_box(occupancy)
-    counts = _few_cells(box, resolution, "a volume")
+    counts = few_cells(box, resolution, "a volume")
     x, y, z = (box.axis(number, count) for number, count in enumerate(counts))
     layers = max(1, CELLS_AT_ONCE // (counts[1] * counts[2]))
 

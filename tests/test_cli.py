@@ -227,6 +227,11 @@ def bad_inputs(folder: Path, file: Path) -> dict[str, list[object]]:
             *("export", file, "--format", "nerfacc-grid", "--resolution", 646),
             *("--out", folder / "grid.pt"),
         ],
+        "a folder of no cells": ["export", file, "--resolution", 1, "--out", folder / "all"],
+        "a report where the points of a start for splats are": [
+            *("export", file, "--format", "splat-init", "--out", folder / "start.json"),
+            *("--json", folder / "start.ply"),
+        ],
         "an export of a foreign file": [
             *("export", folder / "text.safetensors", "--format", "ply"),
             *("--out", folder / "kept.ply"),
@@ -250,6 +255,7 @@ def test_bad_input_ends_with_one_line_and_status_2(
 ) -> None:
     for arguments in bad_inputs(tmp_path, file).values():
         refused(*arguments)
+    assert not (tmp_path / "all").exists()
 
 
 @pytest.mark.parametrize(
