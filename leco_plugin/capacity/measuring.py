@@ -33,7 +33,7 @@ from leco_plugin.models.mixture import Mixture
 from leco_plugin.occupancy import Precision, gate_precision
 from leco_plugin.scenes.input_error import InputError, one_line, require_folder
 from leco_plugin.scenes.photographs import describe_scene
-from leco_plugin.scenes.whole_files import write_json, write_whole
+from leco_plugin.scenes.whole_files import alone_in, write_json, write_whole
 
 FIELD = "field.pt"
 RAYS, TAUGHT_RAYS = 8192, 1 << 15
@@ -232,22 +232,23 @@ def capacity(
     for n in too_large:
         put(f"a grid of {n}^3 cells does not fit the free memory; it is left out")
     candidates = [*gates(), *grids(set(resolutions) - set(too_large))]
-    taught = prepare(data, out, learn_steps)
-    rows = _measure_missing(out, taught, candidates, lost_surface_mass, code)
-    results = {
-        "format": 1,
-        "machine": machine,
-        "scene": {**scene, "train_images": taught.mixture.num_images},
-        **settings,
-        "rays": taught.held_out.rays,
-        "representations": rows,
-        "chosen": dict(choose(rows)),
-        "verdict": answer(rows)[1],
-    }
-    write_json(out / "results.json", results)
-    draw(results, out / "capacity.png", LIGHT)
-    draw(results, out / "capacity-dark.png", DARK)
-    return results
+    with alone_in(out, "points"):  # two processes would teach by two fields
+        taught = prepare(data, out, learn_steps)
+        rows = _measure_missing(out, taught, candidates, lost_surface_mass, code)
+        results = {
+            "format": 1,
+            "machine": machine,
+            "scene": {**scene, "train_images": taught.mixture.num_images},
+            **settings,
+            "rays": taught.held_out.rays,
+            "representations": rows,
+            "chosen": dict(choose(rows)),
+            "verdict": answer(rows)[1],
+        }
+        write_json(out / "results.json", results)
+        draw(results, out / "capacity.png", LIGHT)
+        draw(results, out / "capacity-dark.png", DARK)
+        return results
 
 
 def _measure_missing(

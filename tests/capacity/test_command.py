@@ -18,6 +18,7 @@ from leco_plugin.capacity.measuring import VOLUMES
 from leco_plugin.capacity.search import Candidate, gates
 from leco_plugin.chart.theme import SOURCE, fingerprint
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.whole_files import alone_in
 
 
 def run(*arguments: object) -> int:
@@ -112,6 +113,9 @@ def test_other_settings_and_bad_input_are_refused_in_one_line(
     }
     for cause, arguments in cases.items():
         assert cause in refused("capacity", *arguments)
+    with alone_in(out, "points"):
+        busy = refused("capacity", "--data", tiny_scene, "--out", out, "--grids", 16)
+    assert "another process makes the points in" in busy
     assert not (tmp_path / "new").exists()
 
 
