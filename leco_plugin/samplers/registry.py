@@ -254,12 +254,14 @@ def build_learned(
 def foreign_entries(
     group: str, kind: type[Kind], ours: frozenset[str] = frozenset()
 ) -> dict[str, Kind]:
-    """Loads the entries of a group, which name things of this kind, but for `ours`; a broken one is
-    left out with a warning."""
-    entries = [entry for entry in entry_points(group=group) if entry.name not in ours]
-    loaded = {}
-    for entry in entries:
-        found = _load_entry(entry, kind)
+    """Loads the entries of a group, which name things of this kind, but for `ours`; a broken one,
+    or one whose name is taken, is left out with a warning."""
+    loaded: dict[str, Kind] = {}
+    for entry in entry_points(group=group):
+        if entry.name in ours and entry.value.startswith("leco_plugin."):
+            continue
+        taken = entry.name in ours or entry.name in loaded
+        found = f"{entry.value} has a name that is taken" if taken else _load_entry(entry, kind)
         if isinstance(found, kind):
             loaded[entry.name] = found
         else:

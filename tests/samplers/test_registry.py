@@ -185,11 +185,16 @@ def test_entry_points_of_other_packages_are_found_and_broken_ones_left_out(monke
         EntryPoint("broken", "no_such_module:spec", registry.GROUP),
         EntryPoint("builder", f"{here}:build_dense", registry.GROUP),  # no SamplerSpec
         EntryPoint("dense", "no_such_module:spec", registry.GROUP),  # ours stay ours
+        EntryPoint("foreign", f"{here}:DENSE", registry.GROUP),  # of yet another package
     ]
     monkeypatch.setattr("leco_plugin.samplers.registry.entry_points", lambda group: entries)
     monkeypatch.setattr(registry, "FOREIGN", FOREIGN, raising=False)
-    with pytest.warns(UserWarning, match="leco_plugin.samplers '(broken|builder)' is left out"):
+    with pytest.warns(UserWarning, match="leco_plugin.samplers '.*' is left out") as warned:
         found = samplers()
+    said = [re.findall(r"'(\w+)' is.*?(taken)?$", str(each.message))[0] for each in warned]
+    named = [("broken", ""), ("builder", ""), ("dense", "taken"), ("foreign", "taken")]
+    assert said == named
+    assert found["foreign"] is FOREIGN
     assert set(found) == {*registry.OURS, "foreign"}
     assert found["dense"] is registry.DENSE
     with warnings.catch_warnings():
