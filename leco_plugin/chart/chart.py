@@ -33,7 +33,7 @@ from leco_plugin.learning.schedule import HELD
 from leco_plugin.log import counted
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import describe_held_out, describe_scene, megapixels_of
-from leco_plugin.scenes.whole_files import alone_in, write_json
+from leco_plugin.scenes.whole_files import alone_in, write_json, write_whole
 
 Say = Callable[[str], None]
 NOTHING_SKIPPED = "; no occupancy was learned in this time, so that nothing was skipped"
@@ -216,7 +216,7 @@ class Chart:
         """Writes `results.json` and `table.md`, as far as there are runs; returns the results."""
         results = self.results()
         write_json(self.folder.path / RESULTS, results)
-        (self.folder.path / "table.md").write_text(table(results))
+        write_whole(self.folder.path / "table.md", table(results).encode())
         return results
 
     def draw(self) -> dict[str, Any]:

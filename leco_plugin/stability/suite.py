@@ -30,7 +30,7 @@ from leco_plugin.occupancy import CALIBRATED_AT
 from leco_plugin.scenes.city.folder import TRANSFORMS
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photographs import describe_scene
-from leco_plugin.scenes.whole_files import alone_in, write_json
+from leco_plugin.scenes.whole_files import alone_in, write_json, write_whole
 from leco_plugin.stability import plan
 from leco_plugin.stability.cases import Case, cases_named
 from leco_plugin.stability.photographs import digest_of, write_scene
@@ -245,7 +245,7 @@ class Suite:
         """`stability.json` and `table.md`, as far as there are runs."""
         results = self.results()
         write_json(self.out / "stability.json", results)
-        (self.out / "table.md").write_text(table(results))
+        write_whole(self.out / "table.md", table(results).encode())
         return results
 
     def draw(self) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import resource
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -161,6 +162,23 @@ def test_a_run_says_which_code_its_own_process_had(tmp_path: Path) -> None:
     made.make(lambda line: None, lambda share: None)
     (run,) = made.results()["cases"][0]["cells"]["dense"]["runs"]
     assert run["made"] == made.made | {"sources": "later"}
+
+
+def test_a_full_disk_leaves_the_older_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = suite(tmp_path, ("yard",), ("dense",))
+    made.write()
+    older = (tmp_path / "table.md").read_bytes()
+    monkeypatch.setattr(suite_module, "table", lambda results: "x" * (1 << 20))
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 19, before[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            made.write()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert (tmp_path / "table.md").read_bytes() == older
 
 
 def test_failures_are_drawn_beside_what_is_there(tmp_path: Path) -> None:
