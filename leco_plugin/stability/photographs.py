@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -275,7 +274,8 @@ def count_views(view: View, others: Sequence[View]) -> NDArray[np.int32]:
 def write_scene(stage: Stage, capture: Capture, folder: Path) -> Path:
     """Writes the scene to `folder`, unless it holds just this one; returns the folder.
 
-    The scene appears only when it is complete. A folder with something else is an `InputError`.
+    The scene appears only when it is complete; one process at a time may write it. A folder with
+    something else is an `InputError`.
     """
     description = folder / DESCRIPTION
     described = {"digest": digest_of(stage, capture), "capture": asdict(capture)}
@@ -286,7 +286,7 @@ def write_scene(stage: Stage, capture: Capture, folder: Path) -> Path:
         if description.read_bytes() == text.encode():
             return folder
         shutil.rmtree(folder)
-    unfinished = folder.with_name(f".{folder.name}-{os.getpid()}")
+    unfinished = folder.with_name(f".{folder.name}")  # that of a killed run is removed
     shutil.rmtree(unfinished, ignore_errors=True)
     for name in ("images", TRUTH):
         (unfinished / name).mkdir(parents=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from leco_plugin.scenes.city.cameras import Lens, look_at
 from leco_plugin.scenes.coloured_points import read_points
 from leco_plugin.scenes.frames import distance_from_rotations
 from leco_plugin.scenes.photographs import read_scene
+from leco_plugin.stability import photographs
 from leco_plugin.stability.photographs import (
     STAGES,
     TRUTH,
@@ -198,7 +200,14 @@ def test_exposure_changes_the_light_and_not_the_shape(tmp_path: Path) -> None:
         assert np.array_equal(one[..., 3], two[..., 3]) and not np.array_equal(one, two)
 
 
-def test_a_scene_is_written_once_and_anew_when_it_should_differ(tmp_path: Path) -> None:
+def test_a_scene_is_written_once_and_anew_when_it_should_differ(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(photographs, "transforms_of", Mock(side_effect=KeyboardInterrupt))
+        patch.setattr("os.getpid", lambda: 1)  # of the process that was killed
+        write_scene(YARD, SMALL, tmp_path / "scene")
+    assert not (tmp_path / "scene").exists()
     folder = write_scene(YARD, SMALL, tmp_path / "scene")
     marked = folder / "transforms.json"
     marked.write_text(marked.read_text() + " ")
@@ -207,4 +216,5 @@ def test_a_scene_is_written_once_and_anew_when_it_should_differ(tmp_path: Path) 
     write_scene(STAGES["outline"], SMALL, folder)
     json.loads(marked.read_text())
     assert not marked.read_text().endswith(" ")
+    assert [path.name for path in tmp_path.iterdir()] == ["scene"]
     assert digest_of(YARD, SMALL) != digest_of(STAGES["outline"], SMALL)
