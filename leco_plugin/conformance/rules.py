@@ -176,7 +176,7 @@ RULES = (
         "using its rays.",
         "make every tensor from those of the rays (new_zeros, to), never with a device or "
         "type of its own; write nothing into the rays; one length for all packed tensors, one "
-        "number of samples for all rays; "
+        "number of samples for all rays, also of a batch of one ray; "
         "make ray_samples by ray_bundle.get_ray_samples, so that deltas are ends - starts and "
         "camera_indices, times and metadata are those of the rays (proposal).",
     ),
