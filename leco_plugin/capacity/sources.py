@@ -28,7 +28,7 @@ from leco_plugin.scenes.input_error import InputError, one_line, require_folder
 from leco_plugin.scenes.pixels.held_out_pixels import (
     held_out_sampler,
     some_images,
-    visible_in_tests,
+    visible_in_test,
 )
 from leco_plugin.scenes.pixels.known_distances import batches_of
 from leco_plugin.studio.checkpoints import step_of, whole_of
@@ -209,10 +209,9 @@ def draw_test_rays(source: Source, occupancy: Occupancy, count: int) -> Seen | N
     each = -(-count // len(images["image"]))
     indices, truths = [], []
     for place, (number, image) in enumerate(zip(images["image_idx"].tolist(), images["image"])):
-        sizes = torch.tensor(image.shape[:2])
-        pixels = (torch.rand(each, 2, generator=generator) * sizes).long()
-        of_batch = torch.nn.functional.pad(pixels, (1, 0), value=place)
-        pixels = pixels[visible_in_tests(source.manager, images, of_batch)]
+        data = {key: images[key][place] for key in ("image", "mask") if key in images}
+        pixels = (torch.rand(each, 2, generator=generator) * torch.tensor(image.shape[:2])).long()
+        pixels = pixels[visible_in_test(source.manager, number, data, pixels)]
         indices.append(torch.nn.functional.pad(pixels, (1, 0), value=number))
         truths.append(image[tuple(pixels.T)])
     numbers, places = torch.cat(indices).split([1, 2], dim=1)

@@ -16,7 +16,7 @@ from leco_plugin.learning.dense import evaluating
 from leco_plugin.learning.quality import doubts_of_field, psnr_of_one_colour
 from leco_plugin.log import note
 from leco_plugin.scenes.learning_data import held_out_bundle
-from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler, visible_in_tests
+from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler, visible_in_test
 from leco_plugin.studio.host_models import true_colours
 
 FIRST_AFTER, BETWEEN = 8.0, 10.0
@@ -135,10 +135,7 @@ class HeldOutPsnr:
             image = data["image"]
             places = torch.rand(FEWEST_LAST // len(chosen), 2, generator=generator)
             pixels = (places * torch.tensor(image.shape[:2])).long()
-            alone: dict[str, Any] = {key: [data[key]] for key in ("image", "mask") if key in data}
-            alone["image_idx"] = torch.tensor([number])
-            of_batch = torch.nn.functional.pad(pixels, (1, 0))
-            pixels = pixels[visible_in_tests(self.manager, alone, of_batch)]
+            pixels = pixels[visible_in_test(self.manager, number, data, pixels)]
             if len(pixels) > 0:
                 rays = cameras.generate_rays(camera_indices=number, coords=pixels + 0.5)
                 found.append((rays, image[tuple(pixels.T)]))

@@ -35,6 +35,7 @@ from leco_plugin.hosts.learn_first import FIRST_TIMED, TIMED_STEPS, keep_within
 from leco_plugin.learning.schedule import rate_at
 from leco_plugin.on_cpu import in_float64
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.pixels.held_out_pixels import visible_in_test
 from leco_plugin.studio.host_models import leave_out_the_end, true_colours
 
 RAYS_AT_ONCE = 1024
@@ -327,33 +328,37 @@ def render_rays(model: Any, bundle: Any, at_once: int) -> Tensor:
 
 @torch.no_grad()
 def errors_on_rays(trainer: Trainer, rays: int) -> list[float]:
-    """Mean squared error of each test image on its share of `rays` pixels, the same at every call.
-
-    A full image of an unguided method takes minutes on a CPU; some thousand pixels say as much.
-    """
-    pipeline = trainer.pipeline
+    """Mean squared error of each test image on its share of `rays` pixels, the same at every call,
+    less those that a lens or mask hides; `InputError` where all are. Some thousand pixels say as
+    much as full images, one of which takes an unguided method minutes on a CPU."""
+    pipeline, manager = trainer.pipeline, trainer.pipeline.datamanager
     pipeline.eval()
-    dataset: Any = pipeline.datamanager.eval_dataset
+    dataset: Any = manager.eval_dataset
     generator = torch.Generator().manual_seed(0)
     per_image = -(-rays // len(dataset))
     cameras, errors = dataset.cameras.to("cpu"), []
     for number in range(len(dataset)):
-        image = dataset.get_data(number)["image"]
-        rows, columns = (
-            torch.randint(size, (per_image,), generator=generator) for size in image.shape[:2]
-        )
-        coords = torch.stack([rows, columns], dim=-1) + 0.5
-        bundle = cameras.generate_rays(camera_indices=number, coords=coords).to(pipeline.device)
-        rgb = render_rays(pipeline.model, bundle, RAYS_AT_ONCE)
-        truth = true_colours(pipeline.model, image[rows, columns].to(rgb.device))
+        data = dataset.get_data(number)
+        image = data["image"]
+        drawn = [torch.randint(side, (per_image,), generator=generator) for side in image.shape[:2]]
+        pixels = torch.stack(drawn, dim=-1)
+        pixels = pixels[visible_in_test(manager, number, data, pixels)]
+        if len(pixels) == 0:
+            continue
+        bundle = cameras.generate_rays(camera_indices=number, coords=pixels + 0.5)
+        rgb = render_rays(pipeline.model, bundle.to(pipeline.device), RAYS_AT_ONCE)
+        truth = true_colours(pipeline.model, image[tuple(pixels.T)].to(rgb.device))
         errors.append(float(in_float64((rgb - truth) ** 2).mean()))
     pipeline.train()
+    if not errors:
+        raise InputError("masks hide all test images, on which runs could be compared")
     return errors
 
 
 @torch.no_grad()
 def evaluate_images(trainer: Trainer, most_images: int, queries: Counter[str]) -> dict[str, float]:
-    """Figures over whole test images, evenly chosen; rendering alone is timed.
+    """Figures over whole test images, evenly chosen; rendering alone is timed. What a lens or mask
+    hides counts as rendered right.
 
     The model has to have rendered before, so that nothing is built on the way.
 
@@ -362,9 +367,9 @@ def evaluate_images(trainer: Trainer, most_images: int, queries: Counter[str]) -
         `field_queries_per_ray`, `proposal_queries_per_ray` and `gate_queries_per_ray`; and the
         median of `render_seconds_per_image`.
     """
-    pipeline = trainer.pipeline
+    pipeline, manager = trainer.pipeline, trainer.pipeline.datamanager
     pipeline.eval()
-    dataset: Any = pipeline.datamanager.eval_dataset
+    dataset: Any = manager.eval_dataset
     found: list[dict[str, float]] = []
     clock, times = Clock(), []
     for number in spread_evenly(len(dataset), most_images):
@@ -374,8 +379,11 @@ def evaluate_images(trainer: Trainer, most_images: int, queries: Counter[str]) -
         outputs = pipeline.model.get_outputs_for_camera(camera)
         times.append(clock.stop())
         predicted = outputs["rgb"].clamp(0.0, 1.0)
-        image = dataset.get_data(number)["image"].to(predicted.device)
-        figures = image_metrics(predicted, true_colours(pipeline.model, image))
+        data = dataset.get_data(number)
+        truth = true_colours(pipeline.model, data["image"].to(predicted.device))
+        pixels = torch.ones(truth.shape[:2]).nonzero()
+        shown = visible_in_test(manager, number, data, pixels).view_as(truth[..., :1])
+        figures = image_metrics(predicted.where(shown.to(truth.device), truth), truth)
         for kind in ("field", "proposal", "gate"):
             asked = queries[kind] - before[kind]
             figures[f"{kind}_queries_per_ray"] = asked / (predicted.numel() / 3)

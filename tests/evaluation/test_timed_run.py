@@ -113,6 +113,7 @@ class Pictures:
     def __init__(self) -> None:
         self.cameras = Cameras()
         self.images = [0.1 + 0.5 * torch.rand(*size, 3) for size in ((6, 8), (8, 6), (7, 9))]
+        self.masks: list[Tensor] | None = None
         for image in self.images:
             image[:2] = 1.0
 
@@ -120,7 +121,8 @@ class Pictures:
         return len(self.images)
 
     def get_data(self, number: int) -> dict[str, Tensor]:
-        return {"image": self.images[number]}
+        mask = {} if self.masks is None else {"mask": self.masks[number]}
+        return {"image": self.images[number], **mask}
 
 
 class Renderer(nn.Module):
@@ -181,6 +183,19 @@ def test_pixels_of_all_test_pictures_are_scored_and_always_the_same(time: Time) 
     torch.manual_seed(1)
     assert psnr_on_rays(model.trainer(), 100) == found
     assert model.rays[102:] == model.rays[:102]
+
+
+def test_what_masks_hide_of_test_pictures_is_not_scored(time: Time) -> None:
+    model = Renderer(time)
+    model.pictures.masks = [torch.ones(*image.shape[:2], 1) > 0 for image in model.pictures.images]
+    model.pictures.masks[0][:] = False
+    model.pictures.masks[1][:2] = model.pictures.masks[2][:2] = False  # what is white
+    assert errors_on_rays(model.trainer(), 300) == pytest.approx([0.2**2, 0.3**2], rel=1e-4)
+    hidden = evaluate_images(model.trainer(), 1, model.queries)
+    assert hidden["psnr"] == 120.0 and hidden["ssim"] == pytest.approx(1.0)
+    model.pictures.masks = [torch.zeros_like(mask) for mask in model.pictures.masks]
+    with pytest.raises(InputError, match="masks hide all test images"):
+        errors_on_rays(model.trainer(), 300)
 
 
 @pytest.mark.parametrize(("most", "chosen"), [(9, [0, 1, 2]), (2, [0, 2])])

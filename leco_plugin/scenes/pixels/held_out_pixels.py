@@ -208,8 +208,7 @@ class HeldOutPixelSampler(PixelSampler):
         if isinstance(pictures, StoredPictures):
             return self._sample_stored(pictures, image_batch.get("mask"))
         self.numbers = on_cpu(torch.as_tensor(image_batch["image_idx"]))
-        batch: dict[str, Any] = super().sample(image_batch)
-        return batch
+        return dict(super().sample(image_batch))
 
     def collate_image_dataset_batch_list(
         self, batch: dict[str, Any], num_rays_per_batch: int, keep_full_image: bool = False
@@ -386,12 +385,13 @@ def _pixels_at(images: dict[str, Any], places: Tensor) -> dict[str, Tensor]:
     }
 
 
-def visible_in_tests(manager: Any, images: dict[str, Any], places: Tensor) -> Tensor:
-    """`HeldOutPixelSampler.visible` in a batch of test photographs of any data manager."""
+def visible_in_test(manager: Any, number: int, data: dict[str, Any], pixels: Tensor) -> Tensor:
+    """`HeldOutPixelSampler.visible` of pixels [N, 2] of a test photograph, by a dataset's data."""
     sampler = getattr(manager, "eval_pixel_sampler", None)
     if not isinstance(sampler, HeldOutPixelSampler):
         sampler = HeldOutPixelSampler(getattr(sampler, "config", PixelSamplerConfig()))
-    return sampler.visible(images, places)
+    images = {key: [value] for key, value in {**data, "image_idx": number}.items()}
+    return sampler.visible(images, torch.nn.functional.pad(pixels, (1, 0)))
 
 
 def held_out_sampler(datamanager: Any) -> HeldOutPixelSampler | None:
