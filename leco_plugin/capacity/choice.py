@@ -153,7 +153,7 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
         figure.text(0.015, 0.975, title, va="top", fontsize=17, fontweight="bold")
         lines = found.replace("^3", "³"), circumstances(results)
         said = "\n".join(textwrap.fill(line, 138) for line in lines)
-        figure.text(0.015, 0.9, said, va="top", fontsize=11)
+        figure.text(0.015, 0.9, said, va="top", fontsize=11, parse_math=False)
         panels = [figure.add_axes((0.065 + 0.485 * i, 0.2, 0.435, 0.5)) for i in range(2)]
         share = results["lost_surface_mass"]
         titles = (

@@ -35,15 +35,15 @@ from leco_plugin.chart.theme import (
 
 CLOSE = 0.056
 """Least distance of two names at the ends of curves, as a share of the panel's height."""
-BAR = 0.032
-"""Height of a bar at the foot of a panel, as a share of the panel's."""
+BAR, MOST_BARS = 0.032, 0.45
+"""Height of a bar at the foot of a panel, and the most of all bars, as shares of the panel's."""
 WIDE_RANGE = 8.0
 """Ratio of costs from which on their axis is logarithmic."""
 HIDDEN, RIM = 4.0, 4.0
 """Points between markers up to which one would hide the other, and by which that is larger."""
 TITLE_WIDTH, TEXT_WIDTH = 66, 104
-CHARACTER = 0.0098
-"""Width of a letter, as a share of the figure's."""
+CHARACTER, LONGEST_NAME = 0.0098, 40
+"""Width of a letter, as a share of the figure's; letters of the longest name that is as large."""
 TOP, LINE_HEIGHT, SMALL_LINE_HEIGHT = 0.985, 0.04, 0.0235
 """Top of the title, and line heights of it and of the text below, shares of the figure's height."""
 COSTS_BELOW = "What it costs. Up and left is better; nothing is better in both than the grey line."
@@ -61,7 +61,7 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
         below = TOP - 0.01 - LINE_HEIGHT * (title.count("\n") + 1)
         said = [f"{finding_of(results)}.", circumstances(results)]
         said = [line for one in said for line in textwrap.wrap(one, TEXT_WIDTH)]
-        figure.text(0.015, below, "\n".join(said), va="top", fontsize=11.5)
+        figure.text(0.015, below, "\n".join(said), va="top", fontsize=11.5, parse_math=False)
         below -= SMALL_LINE_HEIGHT * (len(said) - 1)
         if shown.space:
             _draw_occupancies(figure, below, shown, theme)
@@ -81,7 +81,7 @@ def _draw_race(figure: Any, height: float, shown: Shown, theme: Theme) -> None:
     lines = shown.lines
     figure.text(0.015, 0.335, COSTS_BELOW, va="top", fontsize=11.5)
     widest = max(len(name_of_end(line)) for line in lines)
-    right = 0.93 - CHARACTER * min(widest, 40)
+    right = 0.93 - CHARACTER * min(widest, LONGEST_NAME)
     main = figure.add_axes((0.075, 0.43, right - 0.075, height))
     draw_curves(main, lines, theme)
     main.set_title("PSNR on unseen photographs, dB: more is better", fontsize=11.5, loc="left")
@@ -230,7 +230,8 @@ def name_ends(axes: Any, lines: Sequence[Line], theme: Theme, apart: float = CLO
         arrow = {"arrowstyle": "-", "relpos": (0.0, 0.5), "shrinkA": 2.0, "shrinkB": 6.0}
         beside = {"xytext": (1.03, place), "textcoords": "axes fraction", "va": "center"}
         look = {"color": colour, "fontweight": "bold", "arrowprops": {**arrow, "color": colour}}
-        axes.annotate(name_of_end(line), end, annotation_clip=False, **beside, **look)
+        name = axes.annotate(name_of_end(line), end, annotation_clip=False, **beside, **look)
+        name.set_fontsize(name.get_fontsize() * min(1.0, LONGEST_NAME / len(name.get_text())))
 
 
 def name_of_end(line: Line) -> str:
@@ -244,15 +245,18 @@ def _draw_learning(axes: Any, lines: Sequence[Line], theme: Theme) -> None:
     if not bars:
         return
     low, high = axes.get_ylim()
-    share = BAR * (len(bars) + 2.2)
+    share = min(BAR * (len(bars) + 2.2), MOST_BARS)
+    bar = share / (len(bars) + 2.2)
     axes.set_ylim(low - share / (1.0 - share) * (high - low), high)
     foot = axes.get_xaxis_transform()
-    heights = [BAR * (len(bars) - row - 0.2) for row in range(len(bars))]
+    heights = [bar * (len(bars) - row - 0.2) for row in range(len(bars))]
     colours = [style(i, theme)["color"] for i, _ in bars]
-    axes.hlines(heights, 0.0, [time for _, time in bars], colours, transform=foot, linewidth=5)
+    axes.hlines(
+        heights, 0.0, [time for _, time in bars], colours, transform=foot, linewidth=5 * bar / BAR
+    )
     grids = any(not lines[i].learned for i, _ in bars)
     text = " of which learning the occupancy" + (", or updating the grid" if grids else "")
-    axes.text(0.0, BAR * (len(bars) + 0.6), text, transform=foot, fontsize=10)
+    axes.text(0.0, bar * (len(bars) + 0.6), text, transform=foot, fontsize=10)
 
 
 Boxes = NDArray[np.float64]
@@ -351,9 +355,10 @@ def _line_to(box: Any, point: Any) -> Boxes:
 
 
 def spread(wanted: Sequence[float], apart: float) -> list[float]:
-    """Places in [0, 1] as near to the wanted ones as they can be when kept a distance apart."""
+    """Places in [0, 1] as near to the wanted ones as they can be when kept a distance apart, or as
+    far as there is room."""
     order = np.argsort(wanted, kind="stable")
-    steps = apart * np.arange(len(wanted))
+    steps = min(apart, 1.0 / max(1, len(wanted) - 1)) * np.arange(len(wanted))
     lowest = np.maximum.accumulate(np.maximum(np.array(wanted)[order] - steps, 0.0))
     inside = np.minimum(lowest, 1.0 - steps[-1])
     places = np.empty(len(wanted))

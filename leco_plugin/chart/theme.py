@@ -14,7 +14,8 @@ from typing import Any
 
 from leco_plugin.scenes.whole_files import write_whole
 
-MARKERS = "osD^vPX*<>"
+MARKERS = "osD^vPX*<>h"
+"""One more than there are colours, so that the eleventh contender does not look as the first."""
 SOURCE = "Source"
 """Entry of a picture that holds the fingerprint of its results."""
 

@@ -18,6 +18,7 @@ from matplotlib.text import Text
 from page_text import figure_text
 from PIL import Image
 
+from leco_plugin.chart import picture
 from leco_plugin.chart.page import write_page
 from leco_plugin.chart.panels import Panel, Point
 from leco_plugin.chart.picture import (
@@ -35,7 +36,7 @@ from leco_plugin.chart.picture import (
     spread,
 )
 from leco_plugin.chart.summary import best_so_far, lines_of
-from leco_plugin.chart.theme import DARK, LIGHT, SOURCE, Theme, fingerprint
+from leco_plugin.chart.theme import DARK, LIGHT, SOURCE, Theme, fingerprint, style
 
 RUNS = [
     run(name, seed, psnr + seed) for name, psnr in (("A", 20.0), ("B", 23.0)) for seed in (0, 1)
@@ -198,6 +199,23 @@ def test_a_name_that_fits_nowhere_beside_its_point_stays_in_the_panel(x: float) 
     assert box.width > 0.53, "else it fits beside its point"
     anchor, other = (box.x0, box.x1) if text.get_ha() == "left" else (box.x1, box.x0)
     assert abs(anchor - x) <= abs(other - x) + 0.01, "the line leads to the nearer end"
+
+
+@pytest.mark.parametrize(("count", "more"), [(2, " + learned occupancy without gifts"), (40, "")])
+def test_names_and_bars_of_long_and_many_names_stay_in_the_picture(
+    count: int, more: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(picture, "save_picture", lambda figure, *_, **__: figure)
+    runs = [run(f"a method {number}{more}", warming_up=True) for number in range(count - 1)]
+    odd = results(*runs, run("B"), scene={"name": r"$\odd$"})  # which is no formula
+    figure: Any = draw(odd, tmp_path / "chart.png")
+    figure.draw_without_rendering()
+    axes, page = figure.axes[0], figure.bbox
+    boxes = [text.get_window_extent() for text in axes.texts[1:]]
+    assert len(boxes) == count and all(box.x1 <= page.x1 for box in boxes)
+    assert min(box.y0 for box in boxes) > axes.bbox.y0 - 12.0
+    assert axes.get_ylim()[0] < 15.0 < axes.get_ylim()[1], "there is room for the curves"
+    assert len({str(style(number, LIGHT)) for number in range(count)}) == count
 
 
 def test_one_run_with_one_point_is_drawn(tmp_path: Path) -> None:
