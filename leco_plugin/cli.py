@@ -8,6 +8,7 @@ from __future__ import annotations
 import atexit
 import gc
 import io
+import os
 import shlex
 import sys
 import time
@@ -28,7 +29,8 @@ from leco_plugin.names import is_like, options_in, unknown_name
 from leco_plugin.scenes.input_error import one_line
 from leco_plugin.scenes.whole_files import check_place, check_report, write_report
 
-BAD_INPUT, FAILURE = 2, 1
+BAD_INPUT, FAILURE, STOPPED, UNREAD = 2, 1, 130, 141
+"""Statuses; the last two are those of a shell after SIGINT and SIGPIPE."""
 FEW_PICTURES = 20
 """For training: with fewer of a city PSNR scatters by decibels between seeds."""
 SEPARATE = (
@@ -286,13 +288,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
             tyro.extras.subcommand_cli_from_dict(
                 COMMANDS, prog="leco", description=about, args=given
             )
+        sys.stdout.flush()
+    except BrokenPipeError:  # nobody reads on, as behind `| head`; nor what is still to be written
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return UNREAD
     except (ValueError, OSError) as error:
         return _complain(error, BAD_INPUT)
     except (RuntimeError, FloatingPointError, ImportError) as error:
         return _complain(error, FAILURE)
     except KeyboardInterrupt:
         print("leco: stopped; what had been stored stays", file=sys.stderr)
-        return 130
+        return STOPPED
     return 0
 
 

@@ -194,6 +194,18 @@ def test_names_that_are_no_utf_8_are_printed(
     assert capsys.readouterr().out.startswith("not placed: \\udce9.jpg\n")
 
 
+def test_a_command_whose_output_nobody_reads_to_its_end_ends_without_a_word(
+    file: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    with open(writer, "w") as out:
+        monkeypatch.setattr(sys, "stdout", out)
+        assert run("inspect", file) == 141
+        print("more", flush=True)  # as the interpreter does at its end
+    assert capfd.readouterr().err == ""
+
+
 def bad_inputs(folder: Path, file: Path) -> dict[str, list[object]]:
     """Arguments that a user may well give, by what is wrong with them."""
     (folder / "text.safetensors").write_text("not an occupancy")
