@@ -116,7 +116,7 @@ class _Film:
     def still(self, looks: list[int]) -> Any:
         """A figure with a column for each of some looks, over the lines of all."""
         half = len(looks)
-        figure = new_figure((4 * half, 10), dpi=DPI, layout="constrained")
+        figure = new_figure((4 * max(half, 2), 10), dpi=DPI, layout="constrained")
         grid = figure.add_gridspec(3, 2 * half, height_ratios=(1.0, 0.5, 0.8))
         for column, look in enumerate(looks):
             place = slice(2 * column, 2 * column + 2)
@@ -151,7 +151,8 @@ class _Film:
         steps, upto = self.history.steps, None if look is None else look + 1
         for expert in range(self.shares.shape[1]):
             colour = LIGHT.colours[expert % len(LIGHT.colours)]
-            style = {"color": colour, "linewidth": 2.6 if expert == 0 else 1.5}
+            style: dict[str, Any] = {"color": colour, "linewidth": 2.6 if expert == 0 else 1.5}
+            style["marker"] = "o" if len(steps[:upto]) == 1 else None  # which is no line yet
             label = "empty space" if expert == 0 else f"scene expert {expert}"
             above.plot(steps[:upto], 100.0 * self.shares[:upto, expert], label=label, **style)
             below.plot(steps[:upto], self.densities[:upto, expert], **style)
@@ -160,6 +161,6 @@ class _Film:
         highest = 1.5 * max(1.0, float(self.densities.max()))
         below.set(ylabel="mean density, per half extent\n(10⁴: opaque)", ylim=(0, highest))
         for axes in (above, below):
-            axes.set(xlim=(min(steps), max(steps) or 1), xlabel="step")
+            axes.set(xlim=(steps[0], max(steps[-1], steps[0] + 1)), xlabel="step")
             plain(axes, LIGHT)
         above.legend(fontsize=8, ncols=3, loc="upper center")

@@ -61,6 +61,18 @@ def test_a_gif_has_a_frame_for_each_look_and_rests_on_the_last(run: Path) -> Non
         assert film.convert("RGB").tobytes() != first and film.info["duration"] > 4 * seen
 
 
+@pytest.mark.parametrize("name", ["learned.png", "learned.gif"])
+@pytest.mark.parametrize("step", [0, 7])
+def test_a_history_of_one_look_is_drawn_too(run: Path, name: str, step: int) -> None:
+    history = GateHistory()
+    history.look(step, 1.0, ball().gate, torch.tensor([0, 1]), torch.tensor([0.1, 9.0]))
+    history.save(run)
+    file = run / "occupancy.safetensors"
+    assert main(["inspect", str(file), "--history", str(run / name)]) == 0
+    with Image.open(run / name) as picture:
+        assert picture.width >= 8 * 20
+
+
 def test_a_colour_is_the_same_in_every_frame_of_a_film(tmp_path: Path) -> None:
     """Thin lines beside many other colours, which differ from frame to frame."""
     lines = [ImageColor.getrgb(colour) for colour in LIGHT.colours[:5]]
