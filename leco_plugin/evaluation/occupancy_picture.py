@@ -34,7 +34,7 @@ those of a history, and of a picture where no two heights differ."""
 LAYERS, LAYER_CELLS = 24, 96
 """Heights that are compared for the slices of a picture, and cells along the longest side."""
 FLAT = 0.25
-"""Height of a slice, in widths, up to which heights are drawn longer."""
+"""Shorter side of a slice, in longer ones, up to which it is drawn longer."""
 TYPE = 10.0
 """Points."""
 UNSEEN = "#8a8f98"
@@ -123,11 +123,13 @@ def draw_slice(
     values = inspection.query(occupancy, positions)
     low, high = box.low.tolist(), box.high.tolist()
     extent = (low[across], high[across], low[up], high[up])
-    longer = max(1.0, FLAT * float(sides[0] / sides[1]))
-    style = {"cmap": COLOURS, "vmin": 0, "vmax": 1, "aspect": longer}
+    flat = float(sides[0] / sides[1])
+    longer = max(1.0, FLAT * flat, FLAT / flat)
+    aspect = longer if flat > 1.0 else 1.0 / longer
+    style = {"cmap": COLOURS, "vmin": 0, "vmax": 1, "aspect": aspect}
     place = {"origin": "lower", "extent": extent}
     if under is not None:
-        axes.imshow(under, **place, aspect=longer)
+        axes.imshow(under, **place, aspect=aspect)
         style["alpha"] = (values / SOLID).clamp(max=1.0).numpy()
     shown = axes.imshow(values.numpy(), **place, **style)
     unseen = ~inspection.seen_at(occupancy, positions).numpy()
@@ -146,9 +148,13 @@ def draw_slice(
         x, y = cameras[:, across], cameras[:, up]
         axes.scatter(x, y, s=9, c=CAMERA, edgecolors="black", linewidths=0.3, label="cameras")
         axes.set(xlim=extent[:2], ylim=extent[2:])
-    between = "\n" if normal == 2 else ", "  # the upper slices are narrower
-    drawn = f"{between}{AXES[up]} drawn {longer:.1f} times as long" if longer > 1.0 else ""
-    axes.set_title(f"o(x) at {AXES[normal]} = {at:.4g}{drawn}", fontsize=11)
+    title, is_narrow = f"o(x) at {AXES[normal]} = {at:.4g}", FLAT / flat >= 1.0
+    if longer > 1.0:
+        between = "\n" if normal == 2 or is_narrow else ", "  # the upper slices are narrower
+        title += f"{between}{AXES[across if is_narrow else up]} drawn {longer:.1f} times as long"
+    axes.set_title(title, fontsize=11, loc="right" if is_narrow else "center")
+    if is_narrow:
+        axes.locator_params(axis="x", nbins=1, min_n_ticks=1)
     axes.set(xlabel=AXES[across], ylabel=AXES[up])
     axes.tick_params(labelsize=9)
     return shown

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,6 +14,7 @@ import torch
 from ball_occupancy import CENTRE, HALF, RADIUS, WALLS, ball
 from PIL import Image
 
+from leco_plugin.chart.theme import new_figure
 from leco_plugin.evaluation import occupancy_picture
 from leco_plugin.evaluation.inspection import (
     KEPT,
@@ -206,6 +208,18 @@ def test_a_picture_is_made_whatever_is_kept(tmp_path: Path, threshold: float) ->
     occupancy = Occupancy(known.gate, known.space, threshold, report=known.report)
     image = np.asarray(Image.open(draw(occupancy, tmp_path / "picture.png")).convert("L"))
     assert min(image.shape) > 600 and image.std() > 30
+
+
+def test_a_narrow_slice_is_drawn_wider_and_its_numbers_do_not_overlap() -> None:
+    figure = new_figure((10.5, 6.4))
+    axes = figure.add_axes((0.6, 0.1, 0.3, 0.4))
+    box = ViewBox(torch.tensor([0.9, 1.95, -0.7]), torch.tensor([1.1, 2.05, 1.6]))
+    draw_slice(axes, ball(), box, 0, 1.0, pixels=64)
+    figure.draw_without_rendering()
+    assert axes.get_title("right") == "o(x) at x = 1\ny drawn 5.8 times as long"
+    assert axes.bbox.width == pytest.approx(axes.bbox.height / 4, rel=0.01)
+    boxes = [label.get_window_extent() for label in axes.get_xticklabels()]
+    assert boxes and all(one.x1 < other.x0 for one, other in pairwise(boxes))
 
 
 class Axes:
