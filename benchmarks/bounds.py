@@ -19,6 +19,7 @@ from typing import Any
 import checkout  # noqa: F401
 import tyro
 from large_scene_tables import bounds_verdict
+from measured_runs import stored_rows
 
 from leco_plugin.evaluation.clock import Budget
 from leco_plugin.evaluation.report import describe_code, describe_machine, made_by
@@ -84,18 +85,17 @@ def wanted_runs(options: Options) -> list[tuple[Pair | None, bool, int]]:
 
 
 def main(options: Options) -> None:
+    """Trains what is not stored yet, and stores each run; `SystemExit` where runs of other settings
+    are."""
     if options.dry_run:
         options = replace(options, pairs=options.pairs[:2])
     code = describe_code()  # before anything is measured
     settings = {
-        "scene": options.data.name,
+        "scene": options.data.resolve().name,
         "seconds": options.seconds,
         "dry_run": options.dry_run,
     }
-    rows: list[dict[str, Any]] = []
-    if options.out.is_file():
-        stored = json.loads(options.out.read_text())
-        rows = stored["runs"] if stored["settings"] == settings else []
+    rows = stored_rows(options.out, settings)
     for pair, planes, seed in wanted_runs(options):
         key = [list(pair) if pair is not None else None, planes, seed]
         if any([row["range"], row["planes"], row["seed"]] == key for row in rows):

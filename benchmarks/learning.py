@@ -140,7 +140,7 @@ def main() -> None:
     history = file.parent / FILE_NAME
     date = datetime.date.fromtimestamp(history.stat().st_mtime).isoformat()
     found = GateHistory.load(history, as_learned(Occupancy.load(file)).gate)
-    write_json(OUT, report_of(found, file.parent.parent.parent.name, date))
+    write_json(OUT, report_of(found, file.resolve().parents[2].name, date))
     print(f"wrote {OUT}")
 
 

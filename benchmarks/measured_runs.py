@@ -1,7 +1,9 @@
-"""The command line of benchmarks that measure finished runs, and store a row for each scene."""
+"""The command line of benchmarks that measure finished runs, and store a row for each scene; and
+rows that others have stored."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,6 +51,24 @@ def main(
         run, _, data = pair.partition("=")
         if not data:
             raise SystemExit(f"{pair} is not RUN=SCENE")
-        rows[Path(data).name] = {**row_of(Path(run), Path(data)), **made_by(code)}
-        print(Path(data).name, rows[Path(data).name], flush=True)
+        scene = Path(data).resolve().name  # of `.` too
+        rows[scene] = {**row_of(Path(run), Path(data)), **made_by(code)}
+        print(scene, rows[scene], flush=True)
         write_json(out, {"format": 1, "machine": describe_machine(), "scenes": rows})
+
+
+def stored_rows(out: Path, settings: dict[str, Any]) -> list[dict[str, Any]]:
+    """Rows that an earlier run of the same settings has left.
+
+    Raises:
+        SystemExit: they are of other settings.
+    """
+    if not out.is_file():
+        return []
+    stored = json.loads(out.read_text())
+    if stored["settings"] != settings:
+        raise SystemExit(
+            f"{out} holds runs of {stored['settings']}, not of {settings}; name another --out"
+        )
+    rows: list[dict[str, Any]] = stored["runs"]
+    return rows

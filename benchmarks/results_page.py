@@ -129,8 +129,9 @@ experts, no gate* has four scene experts, none for empty space, as Switch-NeRF, 
 - **PSNR** is of 8,192 pixels spread over all test images, all together, less those that a mask or
   a fisheye's rim hides; **mean PSNR of images** is the mean of each image's own on the same pixels,
   as `ns-eval` averages. SSIM, FLIP, LPIPS and the seconds to render are of one whole test image or
-  two, where what is hidden counts as right. FLIP and LPIPS are better when they are less. Qualities are means over seeds, with the least and the most; costs, ratios, and figures of
-  occupancies are medians.
+  two, where what is hidden counts as right. FLIP and LPIPS are better when they are less. Qualities
+  are means over seeds, with the least and the most; costs, ratios, and figures of occupancies are
+  medians.
 - **Ahead**, **level**, **undecided**, **behind**: by the difference of means and its 95% interval
   over seeds (Welch's t). Level is where the interval holds zero and nothing beyond 0.5 dB to a side
   of the difference (of other figures, a quarter of their mean); where it holds zero and more, the

@@ -20,6 +20,7 @@ from typing import Any
 
 import checkout  # noqa: F401
 import tyro
+from measured_runs import stored_rows
 from sizes_figures import AUTOMATIC, bars, verdict
 
 from leco_plugin.evaluation.clock import Budget
@@ -295,23 +296,6 @@ def find(
 def _among(row: dict[str, Any], rows: Sequence[dict[str, Any]]) -> bool:
     names = ("scene", "seed", "sizes")
     return any(all(row[name] == other[name] for name in names) for other in rows)
-
-
-def stored_rows(out: Path, settings: dict[str, Any]) -> list[dict[str, Any]]:
-    """Rows that an earlier run of the same settings has left.
-
-    Raises:
-        SystemExit: they are of other settings.
-    """
-    if not out.is_file():
-        return []
-    stored = json.loads(out.read_text())
-    if stored["settings"] != settings:
-        raise SystemExit(
-            f"{out} holds runs of {stored['settings']}, not of {settings}; name another --out"
-        )
-    rows: list[dict[str, Any]] = stored["runs"]
-    return rows
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -176,6 +177,26 @@ def test_automatic_bounds_come_first_with_each_seed() -> None:
         bounds.Options(Path("scene"), pairs=((1.0, 2.0), (1.0, 3.0)), seeds=(4, 5))
     )
     assert len(wanted) == 10 and wanted[0] == (None, True, 4) and wanted[5] == (None, True, 5)
+
+
+def test_bounds_of_another_scene_are_not_written_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        bounds,
+        "run",
+        lambda _, pair, planes, seed: (
+            {"psnr": 20.0 + seed} | {"range": pair and list(pair), "planes": planes, "seed": seed}
+        ),
+    )
+    options = bounds.Options(tmp_path / "a", pairs=((1.0, 2.0),), out=tmp_path / "bounds.json")
+    bounds.main(options)
+    stored = options.out.read_text()
+    assert len(json.loads(stored)["runs"]) == 6
+    for other in ({"data": tmp_path / "b"}, {"dry_run": True}):
+        with pytest.raises(SystemExit, match="name another --out"):
+            bounds.main(replace(options, **other))
+    assert options.out.read_text() == stored
 
 
 def test_the_stored_result_keeps_more_than_the_allowance_on_disk() -> None:

@@ -11,8 +11,9 @@ import measured_runs
 import pytest
 import samples
 import sizes_sections
+from measured_runs import stored_rows
 from page_parts import made_line
-from sizes import TABLE, Options, dry, larger, stored_rows, sweep
+from sizes import TABLE, Options, dry, larger, sweep
 from sizes_figures import bars, verdict
 from sizes_tables import (
     capacity_table,
