@@ -209,7 +209,9 @@ def draw_test_rays(source: Source, occupancy: Occupancy, count: int) -> Seen | N
     each = -(-count // len(images["image"]))
     indices, truths = [], []
     for place, (number, image) in enumerate(zip(images["image_idx"].tolist(), images["image"])):
-        data = {key: images[key][place] for key in ("image", "mask") if key in images}
+        data: dict[str, Any] = {
+            key: images[key][place] for key in ("image", "mask") if key in images
+        }
         pixels = (torch.rand(each, 2, generator=generator) * torch.tensor(image.shape[:2])).long()
         pixels = pixels[visible_in_test(source.manager, number, data, pixels)]
         indices.append(torch.nn.functional.pad(pixels, (1, 0), value=number))
