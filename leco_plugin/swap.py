@@ -20,7 +20,7 @@ from leco_plugin.hosts.guided_start import OccupancyConfig, load_occupancy, occu
 from leco_plugin.method_configs import LEARNING, ON_GPU, best_device
 from leco_plugin.models.sizing.sizes import learning_only
 from leco_plugin.names import unknown_name
-from leco_plugin.samplers.registry import check_gate, refuse_unknown_options
+from leco_plugin.samplers.registry import check_gate, refuse_unknown_options, sampler_spec
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.reading import with_checks
 from leco_plugin.studio.dynamic_batch import clamped
@@ -50,20 +50,14 @@ def swapped_config(
     `other_scene` as of `OccupancyConfig`, whose `seconds` are `learn_seconds`.
 
     Raises:
-        InputError: an occupancy is given, and seconds for learning one; there is no such method,
-            or it is guided, learns occupancy itself or draws no rays; there is no such sampler, or
-            it asks another kind of gate, or has no such option; there is no such file, or it is no
-            occupancy; the arguments name a config that would replace this one, or no scene.
+        InputError: an occupancy is given, and seconds for learning one, or either of them to a
+            sampler that asks none; there is no such method, or it is guided, learns occupancy
+            itself or draws no rays; there is no such sampler, or it asks another kind of gate, or
+            has no such option; there is no such file, or it is no occupancy; the arguments name a
+            config that would replace this one, or no scene.
         SystemExit: the arguments are none of the method's; tyro has said why.
     """
-    if file is not None and learn_seconds is not None:
-        raise InputError("--occupancy gives what --learn-seconds would learn: leave one out")
-    try:
-        gate = LEARNING.sizes.gate if file is None else load_occupancy(file).gate.config
-        check_gate(sampler, gate)
-        refuse_unknown_options(sampler, options)
-    except ValueError as error:
-        raise InputError(str(error)) from None
+    _check_sampler(sampler, options, file, learn_seconds)
     config = tyro.cli(
         tyro.conf.SuppressFixed[tyro.conf.FlagConversionOff[TrainerConfig]],
         default=registered(method),
@@ -80,6 +74,23 @@ def swapped_config(
     made = with_sampler_swapped(config, file, sampler, options, codes, other_scene)
     made.pipeline.model.occupancy.seconds = learn_seconds  # type: ignore[attr-defined]
     return made
+
+
+def _check_sampler(
+    sampler: str, options: Mapping[str, int | float], file: Path | None, learn_seconds: float | None
+) -> None:
+    """InputError as `swapped_config` says, of what is given to a sampler."""
+    if file is not None and learn_seconds is not None:
+        raise InputError("--occupancy gives what --learn-seconds would learn: leave one out")
+    try:
+        gate = LEARNING.sizes.gate if file is None else load_occupancy(file).gate.config
+        check_gate(sampler, gate)
+        refuse_unknown_options(sampler, options)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+    if (file or learn_seconds is not None) and not sampler_spec(sampler).needs_occupancy:
+        unused = "leave --occupancy and --learn-seconds out"
+        raise InputError(f"the sampler {sampler!r} asks no occupancy: {unused}")
 
 
 def registered(method: str) -> TrainerConfig:

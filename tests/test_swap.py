@@ -134,6 +134,14 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         "--load-config would train what that file says",
     ),
     "seconds for what is given": ({"learn_seconds": 9.0}, "leave one out"),
+    "a file for a grid": (
+        {"sampler": "occupancy-grid"},
+        "asks no occupancy: leave --occupancy and",
+    ),
+    "seconds for a grid": (
+        {"sampler": "dense", "file": None, "learn_seconds": 9.0},
+        "'dense' asks no occupancy",
+    ),
     "a file that is not there": ({"file": Path("none.safetensors")}, "there is no occupancy"),
 }
 

@@ -148,16 +148,22 @@ def draw_slice(
         x, y = cameras[:, across], cameras[:, up]
         axes.scatter(x, y, s=9, c=CAMERA, edgecolors="black", linewidths=0.3, label="cameras")
         axes.set(xlim=extent[:2], ylim=extent[2:])
-    title, is_narrow = f"o(x) at {AXES[normal]} = {at:.4g}", FLAT / flat >= 1.0
+    _name_slice(axes, normal, at, longer, FLAT / flat >= 1.0)
+    return shown
+
+
+def _name_slice(axes: Any, normal: int, at: float, longer: float, is_narrow: bool) -> None:
+    """Names a slice and its axes; `longer` is how many times as long one of them is drawn."""
+    across, up = (AXES[a] for a in range(3) if a != normal)
+    title = f"o(x) at {AXES[normal]} = {at:.4g}"
     if longer > 1.0:
         between = "\n" if normal == 2 or is_narrow else ", "  # the upper slices are narrower
-        title += f"{between}{AXES[across if is_narrow else up]} drawn {longer:.1f} times as long"
+        title += f"{between}{across if is_narrow else up} drawn {longer:.1f} times as long"
     axes.set_title(title, fontsize=11, loc="right" if is_narrow else "center")
     if is_narrow:
         axes.locator_params(axis="x", nbins=1, min_n_ticks=1)
-    axes.set(xlabel=AXES[across], ylabel=AXES[up])
+    axes.set(xlabel=across, ylabel=up)
     axes.tick_params(labelsize=9)
-    return shown
 
 
 def middle_of(points: Tensor, box: ViewBox) -> Tensor:

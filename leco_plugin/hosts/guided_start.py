@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -44,6 +45,7 @@ LEARNING = (
     "folder be given here with --pipeline.model.occupancy.path (leco swap: --occupancy)"
 )
 
+SECONDS = "--pipeline.model.occupancy.seconds"
 OWN_SAMPLER = "own"
 """Name of no sampler: the host keeps its own."""
 
@@ -104,6 +106,20 @@ def load_occupancy(path: Path) -> Occupancy:
         raise InputError(f"no occupancy can be read: {error}") from None
 
 
+def say_if_another(occupancy: Occupancy, path: Path | None) -> None:
+    """Says so where a run goes on with the occupancy of its checkpoint, and the file that `path`
+    means has another gate. A file that is gone says nothing."""
+    if path is None:
+        return
+    with suppress(InputError):
+        file = load_occupancy(path).gate
+        if file.config != occupancy.gate.config or not all(
+            torch.equal(one.cpu(), other.cpu())
+            for one, other in zip(file.parameters(), occupancy.gate.parameters(), strict=True)
+        ):
+            say(f"goes on with the occupancy of its checkpoint, which is not that of {path}")
+
+
 class GuidedStart:
     """The start of one training run of a guided host. A guide has an occupancy already where a file
     or a checkpoint gave one; without a run no file is left, and a teacher leaves its own.
@@ -127,10 +143,16 @@ class GuidedStart:
         self.begun = False
         if guide.occupancy is None and config.path is not None:
             guide.set_occupancy(load_occupancy(config.path))  # says why it could not be before
+        elif guide.occupancy is not None and self.run.start > 0 and config.learned == "first":
+            say_if_another(guide.occupancy, config.path)
         if guide.occupancy is None:
             from leco_plugin.hosts.learn_first import check_budget
 
             check_budget(config.rays, config.seconds, config.rate)
+            if config.learned == "along" and config.seconds is not None:
+                raise InputError(
+                    f"{SECONDS} is of learning first; a host that learns along has none"
+                )
         learned = guide.occupancy.gate.config if guide.occupancy is not None else None
         own, small = config.learning.sizes.gate, config.learning.sharpening.gate
         try:

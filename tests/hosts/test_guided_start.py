@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -201,6 +202,23 @@ def test_a_checkpoint_needs_no_file(data: Data, balls_guide: Guide) -> None:
     assert balls_guide.occupancy is not None
 
 
+def test_a_resumed_run_says_that_the_file_given_is_not_the_occupancy_of_its_checkpoint(
+    data: Data, balls_guide: Guide, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = []
+    for name, changed in (("same", 0.0), ("other", 1.0)):
+        file = copy.deepcopy(ball_of_the_tiny_scene())  # its gate is everybody's
+        with torch.no_grad():
+            next(file.gate.parameters()).add_(changed)
+        file.save(tmp_path / name)
+        for begins_at in (0, 90):
+            (run := LearningOnly()).start = begins_at
+            GuidedStart(nn.Module(), balls_guide, OccupancyConfig(tmp_path / name), Pipe(data), run)
+            said = " ".join(capsys.readouterr().out.split())
+            told.append("goes on with the occupancy of its checkpoint, which is not" in said)
+    assert told == [False, False, False, True]
+
+
 def test_a_sampler_and_a_gate_that_do_not_fit_are_refused_before_learning(data: Data) -> None:
     name = "learned-occupancy-hash"
     with pytest.raises(InputError, match=f"{name}.* asks a gate on hash features"):
@@ -216,6 +234,8 @@ def test_a_budget_in_which_nothing_can_be_learned_is_refused_before_the_first_st
     for config in (OccupancyConfig(seconds=0.0), OccupancyConfig(rays=0)):
         with pytest.raises(InputError, match="an occupancy is learned"):
             start(data, Guide(), config)
+    with pytest.raises(InputError, match=r"seconds is of learning first; .* along has none"):
+        start(data, Guide(), OccupancyConfig(learned="along", seconds=9.0))
 
 
 def leco_ngp_with(occupancy: OccupancyConfig, scene: Path) -> Any:
