@@ -108,6 +108,29 @@ def test_distances_are_for_learning_alone(
     assert made.sampler.sparse is (points if wanted else None)
 
 
+@pytest.mark.parametrize(
+    ("options", "frozen", "aside"),
+    [
+        ({}, False, 9),
+        ({}, True, 0),
+        ({"homogeneous": True}, False, 0),
+        ({"schedule": ScheduleConfig(freeze=False)}, False, 0),
+    ],
+)
+def test_photographs_vouch_while_a_gate_is_learned_and_train_afterwards(
+    options: dict[str, Any], frozen: bool, aside: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learner = small_learner(**options)
+    if frozen:
+        learner.mixture.freeze(0.5, {"empty_fraction": 0.0})
+    asked: list[int] = []
+    monkeypatch.setattr(
+        learner.data, "prepare_batch", lambda *_, set_aside, **__: asked.append(set_aside)
+    )
+    learner.before_step(0)
+    assert asked == [aside]
+
+
 def test_a_sampler_elsewhere_is_left_alone(made: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(learning_data, "sampler_here", lambda manager: None)
     made.progress.learning_kept = 0.1
