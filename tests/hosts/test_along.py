@@ -171,6 +171,17 @@ def test_rays_of_several_batches_are_heard_as_one(made: Any, data: Data) -> None
     assert float(both.weights.max()) > 0.5
 
 
+def test_what_a_host_prunes_is_heard_all_the_same(
+    made: Any, data: Data, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bundle = data.train_dataset.cameras.generate_rays(0).flatten()
+    whole = made.teacher._hear([bundle])
+    monkeypatch.setitem(MARCH, "early_stop_eps", 0.5)
+    monkeypatch.setitem(MARCH, "alpha_thre", 0.5)
+    pruned = made.teacher._hear([bundle])
+    assert torch.equal(pruned.mapped, whole.mapped) and torch.equal(pruned.weights, whole.weights)
+
+
 def test_all_its_gates_together_cost_no_more_than_the_bound(
     made: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
