@@ -43,10 +43,13 @@ def test_a_frozen_gate_of_a_checkpoint_does_not_learn_again() -> None:
     assert all(parameter.requires_grad for parameter in restored.gate.parameters())
 
 
-def test_a_gate_that_is_frozen_again_skips_by_its_new_threshold() -> None:
+@pytest.mark.parametrize("loaded", [False, True])
+def test_a_gate_that_is_frozen_again_skips_by_its_new_threshold(loaded: bool) -> None:
     mixture = small_mixture()
     for threshold in (0.3, 0.1):
-        mixture.freeze(threshold, {})
+        frozen = small_mixture() if loaded else mixture
+        frozen.freeze(threshold, {})
+        mixture.load_state_dict(frozen.state_dict())
         found = mixture.estimator().occupancy.threshold
         assert abs(found - threshold) < 1e-6
 
