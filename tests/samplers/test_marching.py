@@ -246,6 +246,8 @@ def test_boxes_are_entered_and_left_where_they_are_cut(seed):
     origins, directions = torch.randn(20, 3), torch.randn(20, 3)
     directions[0], origins[0, 1] = torch.tensor([1.0, 0.0, 0.0]), 0.3
     box = torch.tensor([-0.5, -0.7, -0.3, 0.4, 0.9, 0.6])
+    for ray, face in ((1, box[0]), (2, box[3])):  # along a face
+        directions[ray], origins[ray] = torch.tensor([0.0, 1.0, 0.0]), torch.tensor([face, 0, 0.1])
     enters, leaves = intersect_box(origins, directions, box)
     for ray in range(20):
         t = torch.linspace(-6.0, 6.0, 2001)
