@@ -18,6 +18,7 @@ from leco_plugin.models.front_to_back import (
     FEWEST_AT_ONCE,
     LEAST_LIGHT,
     MANY_RAYS,
+    MOST_LOOKS,
     is_no_slower,
     samples_of,
     shade_front_to_back,
@@ -110,8 +111,14 @@ def test_it_renders_what_asking_about_everything_renders(
 
 
 @pytest.mark.usefixtures("by")
-@pytest.mark.parametrize("density", [0.001, 0.03, 1.0, 30.0])
-def test_of_two_neighbours_that_are_faint_one_is_enough(density: float) -> None:
+@pytest.mark.parametrize(
+    ("density", "looks"),
+    [(0.001, MOST_LOOKS), (0.01, 5), (0.03, MOST_LOOKS), (1.0, MOST_LOOKS), (30.0, MOST_LOOKS)],
+)
+def test_of_two_neighbours_that_are_faint_one_is_enough(
+    density: float, looks: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(front_to_back, "MOST_LOOKS", looks)
     scene, rays = scene_of(density), some_rays(150)
     everything = kept_along(rays)
     with torch.no_grad():
