@@ -106,10 +106,10 @@ def test_a_damaged_or_foreign_field_is_refused(mixture: Mixture, tmp_path: Path)
         field_at_freezing(mixture, tmp_path)
 
 
-@pytest.mark.parametrize("what", ["checkpoint", "folder"])
+@pytest.mark.parametrize("what", ["checkpoint", "folder", "here"])
 @pytest.mark.parametrize("models", ["nerfstudio_models", "models/of_this"])
 def test_a_resumed_run_takes_it_along(
-    what: str, models: str, mixture: Mixture, tmp_path: Path
+    what: str, models: str, mixture: Mixture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     leave_field(mixture, first)
@@ -117,7 +117,9 @@ def test_a_resumed_run_takes_it_along(
     checkpoint = first / models / "step-000000009.ckpt"
     checkpoint.parent.mkdir(parents=True)
     checkpoint.write_bytes(b"")
-    carry_over(checkpoint if what == "checkpoint" else checkpoint.parent, second)
+    monkeypatch.chdir(checkpoint.parent)
+    given = {"checkpoint": checkpoint, "folder": checkpoint.parent, "here": Path()}
+    carry_over(given[what], second)
     assert (second / FIELD_FILE).read_bytes() == (first / FIELD_FILE).read_bytes()
     (second / FIELD_FILE).write_bytes(b"its own")
     carry_over(checkpoint, second)
