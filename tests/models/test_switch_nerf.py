@@ -25,6 +25,7 @@ from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.grid import OccupancyGridEstimator
 from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.space import SpaceKind
 
 TINY = SwitchSizes(
     field=SwitchFieldConfig(
@@ -243,13 +244,15 @@ def test_a_checkpoint_brings_back_the_same_pixels(sampling, bounds, tmp_path: Pa
     assert bool(other.region.known)
 
 
-def test_a_density_is_that_of_the_scenes_units() -> None:
-    model = new_model(SceneBounds("box", torch.zeros(3), 4.0, 0.1, 4.0, NO_WALLS, ""))
+@pytest.mark.parametrize("kind", ["box", "contraction"])
+def test_a_density_is_that_of_the_scenes_units(kind: SpaceKind) -> None:
+    model = new_model(SceneBounds(kind, torch.zeros(3), 4.0, 0.1, 4.0, NO_WALLS, ""))
     positions = torch.rand(6, 3) * 8 - 4
     model.precision = "float32"
-    asked = model.field(positions / 4.0).sigmas[:, None] / 4.0
+    mapped = positions / (4.0 if kind == "box" else 8.0)
+    asked = model.field(mapped).sigmas[:, None] / 4.0
     torch.testing.assert_close(model.density_fn(positions), asked)
-    step = float(model.step)
+    step = float(model.step if kind == "box" else model.cone * 4.0)
     torch.testing.assert_close(model.opacity_of_a_step(positions), asked * step)
 
 
