@@ -155,6 +155,18 @@ def test_what_guides_a_host_takes_the_place_of_nothing_that_it_has() -> None:
     assert isinstance(model.leco_guide, Guide)
 
 
+@pytest.mark.parametrize("sampler", ["own", "dense"])
+def test_a_host_renders_as_many_rays_at_a_time_as_are_asked_for(sampler: str) -> None:
+    config: Any = with_sampler_swapped(small("instant-ngp"), Path("none")).pipeline.model
+    config.occupancy.sampler = sampler
+    of_host = config.host.eval_num_rays_per_chunk
+    for asked, expected in ((7, 7), (None, of_host)):
+        config.eval_num_rays_per_chunk = asked
+        made = config.setup(**model_arguments())
+        assert made.config.eval_num_rays_per_chunk == expected
+    assert config.host.eval_num_rays_per_chunk == of_host
+
+
 class TakesABatch(NGPModel):
     """May be told the batch that its rays are of."""
 
