@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -267,6 +268,15 @@ def test_every_contender_is_in_it_with_its_curve(page: Path) -> None:
     text = figure_text(page)
     assert text.count('"name":"B"') >= 4  # a curve and a point for each cost
     assert "seconds of training" in text and "volume kept at equal loss" in text
+
+
+def test_bars_on_the_page_go_from_the_worst_seed_to_the_best(tmp_path: Path) -> None:
+    seeds = [run("A", seed, psnr) for seed, psnr in enumerate((20.0, 21.0, 25.0))]
+    traces = json.loads(figure_text(write_page(results(*seeds), tmp_path / "chart.html")))["data"]
+    bars = [trace["error_y"] for trace in traces if "error_y" in trace]
+    assert len(bars) == 3, "one for each cost"
+    for bar in bars:  # around the mean, 22 dB
+        assert (bar["array"], bar["arrayminus"]) == ([3.0], [2.0])
 
 
 def test_a_chart_without_occupancies_has_no_row_for_them(tmp_path: Path) -> None:
