@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from leco_plugin.conformance.scene import STEP
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.marching import Samples
@@ -291,6 +292,17 @@ class NearPlaneWithLimitsOnly(Sound):
         return super().sampling(rays_o, rays_d, *args, **options)
 
 
+class EndsTooSoonWithoutLimits(Sound):
+    """Rays without limits of their own lack their last samples before the far plane."""
+
+    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
+        ray_indices, t_starts, t_ends = super().sampling(rays_o, rays_d, *args, **options)
+        if options["t_max"] is not None:
+            return ray_indices, t_starts, t_ends
+        kept = t_ends < options["far_plane"] - 4 * STEP
+        return ray_indices[kept], t_starts[kept], t_ends[kept]
+
+
 class ClippedToTheBox(LearnedOccupancyEstimator):
     """Takes the box of the host's grid for the end of the scene."""
 
@@ -326,6 +338,7 @@ MUTANTS: dict[str, tuple[type, ...]] = {
         FarPlaneIgnored,
         NeedsLimits,
         NearPlaneWithLimitsOnly,
+        EndsTooSoonWithoutLimits,
     ),
     "packing-consistent": (ShortIndices, RaysInPieces),
     "deterministic-in-eval": (AlwaysShaking,),
