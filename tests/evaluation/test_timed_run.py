@@ -54,14 +54,14 @@ def rate_at(course: _Course, group: Any, seconds: float, step: int) -> float:
     return float(group["lr"])
 
 
-def test_rates_of_a_host_that_learns_first_count_from_its_own_first_step() -> None:
+def test_rates_of_a_host_that_learns_first_count_from_its_own_first_step(time: Time) -> None:
     host = nn.Linear(1, 1)
     host.leco_guide = nn.Module()
     host.leco_guide.occupancy = None
     course, group = course_of(host)
     assert rate_at(course, group, 0.0, 0) == RATE
     host.leco_guide.occupancy = SimpleNamespace(report={})
-    course.clock.seconds = 40.0  # learning is a part of the first step
+    time.now += 40.0  # learning is a part of the first step, which goes on
     course.begun(0)
     assert course.run.learn_seconds == pytest.approx(40.0, abs=1.0)
     assert rate_at(course, group, 84.5, 1) == pytest.approx(RATE, rel=0.02)
