@@ -57,6 +57,18 @@ def test_the_never_frozen_run_skips_nothing_as_in_charts() -> None:
     assert replace(ours, schedule=theirs.schedule) == theirs
 
 
+@pytest.mark.parametrize(("seconds", "share"), [(75.0, 0.5), (150.0, 1.0), (600.0, 1.0)])
+def test_a_short_demo_learns_for_fewer_steps_and_a_long_one_for_no_more(
+    seconds: float, share: float
+) -> None:
+    from leco_plugin import demo
+    from leco_plugin.method_configs import leco_occupancy
+
+    usual, made = leco_occupancy.config, demo._config(Path("city"), Path("out"), seconds)
+    steps, learned = (each.pipeline.model.schedule.learn_steps for each in (usual, made))
+    assert learned == share * steps
+
+
 @pytest.mark.slow
 @pytest.mark.xdist_group("commands")
 def test_the_demo_reports_both_runs_in_the_agreed_form(
