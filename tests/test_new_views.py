@@ -18,7 +18,9 @@ from sharpening import confirmed, sharpening_sections
 from leco_plugin.capacity.evidence import Evidence, Rendered
 from leco_plugin.capacity.sources import find_source
 from leco_plugin.cli_occupancy import occupancy_of
-from leco_plugin.models.rendering import Intervals
+from leco_plugin.learning.dense import Reference, dense_reference
+from leco_plugin.models.mixture import Mixture
+from leco_plugin.models.rendering import Intervals, Rays
 from leco_plugin.occupancy import CAMERAS_THAT_VOUCH
 
 
@@ -73,14 +75,39 @@ def test_a_photograph_at_its_bound_is_within_it() -> None:
     assert "| town | 0.20% | 90% | 1 of 3 | 0.10% | 0.30% |" in said
 
 
-def test_each_test_photograph_is_decoded_once(
-    known_run: Path, tiny_scene: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    source = find_source(occupancy_of(known_run), tiny_scene)
+def promised_of(run: Path, scene: Path, monkeypatch: pytest.MonkeyPatch) -> Mixture:
+    """What the benchmark finds of a run, whose gate is vouched for; its mixture."""
+    source = find_source(occupancy_of(run), scene)
     frozen = source.mixture
     assert frozen is not None
     frozen.report[CAMERAS_THAT_VOUCH] = {"count": 2, "bound": 2e-3, "confidence": 0.6}
     monkeypatch.setattr(promises, "find_source", lambda *_: source._replace(frozen=frozen))
+    return frozen
+
+
+def test_what_no_ray_came_near_is_lost_but_for_backdrops(
+    known_run: Path, tiny_scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing here was seen, and all that rays meet counts alike."""
+    promised_of(known_run, tiny_scene, monkeypatch).region.seen.cells[:] = False
+    backdrops: list[float] = []
+
+    def alike(mixture: Mixture, rays: Rays) -> Reference:
+        found = dense_reference(mixture, rays)
+        backdrops.append(float(found.always_kept.double().mean()))
+        ones = torch.ones_like(found.weights)
+        return found._replace(weights=ones, near_surface=ones.bool())
+
+    monkeypatch.setattr(promises, "dense_reference", alike)
+    found = promises.row_of(known_run, tiny_scene)
+    assert found["lost"] == pytest.approx([1.0 - share for share in backdrops])
+    assert len(backdrops) == 2 and min(backdrops) > 0.0
+
+
+def test_each_test_photograph_is_decoded_once(
+    known_run: Path, tiny_scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    promised_of(known_run, tiny_scene, monkeypatch)
     decode, decoded = InputDataset.get_numpy_image, Counter[int]()
 
     def counted(dataset: InputDataset, number: int) -> Any:
