@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
+from types import SimpleNamespace
 from typing import Any
 
+import profile_steps
 import pytest
 import torch
 from gpu_floor import Ceilings
@@ -90,6 +92,39 @@ def test_a_hash_grid_reads_four_rows_a_level() -> None:
     assert work.backward_bytes == 4 * (5 * 3 + 5 * 6 + 2 * looked_up + zeros)
     with torch.no_grad():
         assert of_encoding(grid)(grid(places), places).backward_bytes == 0
+
+
+def test_steps_without_the_profiler_are_those_just_before_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By the clock of this test; the profiler makes a step ten times as long."""
+    now, parts = [0.0], Parts()
+    taken = iter((9.0, 1.0, 3.0, 20.0, 20.0, 5.0, 7.0, 60.0, 60.0))
+    monkeypatch.setattr(profile_steps, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+
+    class Trainer:
+        stop_training = False
+
+        def __init__(self) -> None:
+            self.guide = SimpleNamespace(occupancy=None)
+            self.pipeline = SimpleNamespace(model=SimpleNamespace(leco_guide=self.guide))
+
+        def train_iteration(self, step: int) -> int:
+            now[0] += next(taken)
+            return step
+
+    trainer = Trainer()
+    parts.name(trainer, "train_iteration", REST, lambda step, _: Work(rays=10 * step))
+    begins = {"learning": 3, "guided": 2}
+    course = profile_steps.Course(trainer, parts, begins, 2, Ceilings(1.0, 1.0))
+    for step in range(9):
+        assert not trainer.stop_training
+        if step == 5:
+            trainer.guide.occupancy = "learned"
+        assert trainer.train_iteration(step) == step
+    assert trainer.stop_training
+    found = {phase: (its["unprofiled_ms"], its["rays"]) for phase, its in course.found.items()}
+    assert found == {"learning": (2000.0, 35.0), "guided": (6000.0, 75.0)}
 
 
 def test_the_page_says_what_takes_most() -> None:
