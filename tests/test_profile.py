@@ -62,7 +62,9 @@ def profiled(net: _Net) -> tuple[Times, Parts]:
 
 
 def test_a_slow_backward_belongs_to_the_part_whose_forward_made_it() -> None:
-    times, parts = profiled(_Net())
+    # a busy machine may stop any of them for a while, not all
+    tries = [profiled(_Net()) for _ in range(5)]
+    times, parts = min(tries, key=lambda found: found[0].total)
     assert times.backward["slow"] > SLOW
     others = times.total - times.backward["slow"]
     assert others < SLOW / 2 and times.backward["quick"] > 0.0 < times.forward[REST]
