@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import json
 import statistics
+from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -27,7 +28,15 @@ from page_parts import RESULTS, made_line, section, table
 from torch import Tensor
 
 from leco_plugin.chart.table import spread
-from leco_plugin.evaluation.report import describe_code, describe_machine, made_by, read_object
+from leco_plugin.evaluation.clock import Budget
+from leco_plugin.evaluation.metrics import psnr
+from leco_plugin.evaluation.report import (
+    describe_code,
+    describe_machine,
+    finite_or_null,
+    made_by,
+    read_object,
+)
 from leco_plugin.models import losses
 from leco_plugin.scenes.whole_files import write_json
 
@@ -77,34 +86,36 @@ def thin_error(predicted: Tensor, truth: Tensor) -> float:
     return float((predicted - truth)[thin].square().sum() / contrast[thin].square().sum())
 
 
+def figures_of(predicted: Tensor, truth: Tensor) -> dict[str, float]:
+    """`FIGURES` of an image, in the place of `image_metrics`."""
+    measures = (psnr, hue_error, thin_error)
+    return {name: measure(predicted, truth) for name, measure in zip(FIGURES, measures)}
+
+
 def train(data: Path, seconds: float, seed: int, weight: float) -> dict[str, Any]:
     """The figures of a run, means over its test photographs."""
-    from leco_plugin.evaluation.clock import Budget
-    from leco_plugin.evaluation.metrics import psnr, spread_evenly
-    from leco_plugin.evaluation.timed_run import timed_run
+    from leco_plugin.evaluation import timed_run as runs
     from leco_plugin.method_configs import leco_occupancy
-    from leco_plugin.studio.host_models import true_colours
 
     torch.set_num_threads(1)
-    code = describe_code()
+    code, budget = describe_code(), Budget(seconds=seconds)
     config: Any = copy.deepcopy(leco_occupancy.config)
     config.data = config.pipeline.datamanager.data = data
     with TemporaryDirectory() as folder, patch.object(losses, "HUE_WEIGHT", weight):
         config.output_dir = Path(folder)
-        budget = Budget(seconds=seconds)
-        run, trainer = timed_run(config, budget, sampler="", seed=seed, curve_points=0, images=0)
-    pipeline: Any = trainer.pipeline
-    pipeline.eval()
-    dataset, found = pipeline.datamanager.eval_dataset, []
-    for number in spread_evenly(len(dataset), IMAGES):
-        camera = dataset.cameras[number : number + 1].to(pipeline.device)
-        predicted = pipeline.model.get_outputs_for_camera(camera)["rgb"].clamp(0.0, 1.0)
-        image = dataset.get_data(number)["image"].to(predicted.device)
-        pair = predicted, true_colours(pipeline.model, image)
-        found.append((psnr(*pair), hue_error(*pair), thin_error(*pair)))
-    means = (round(statistics.fmean(values), 4) for values in zip(*found))
-    asked = {"scene": data.name, "seed": seed, "weight": weight, "seconds": seconds}
-    return {**asked, "steps": run.steps, **dict(zip(FIGURES, means)), **made_by(code)}
+        run, trainer = runs.timed_run(
+            config, budget, sampler="", seed=seed, curve_points=0, images=0
+        )
+    with patch.object(runs, "image_metrics", figures_of):
+        means = runs.evaluate_images(trainer, IMAGES, Counter())
+    found = finite_or_null({name: round(means[name], 4) for name in FIGURES})
+    asked = {"scene": name_of(data), "seed": seed, "weight": weight, "seconds": seconds}
+    return {**asked, "steps": run.steps, **found, **made_by(code)}
+
+
+def name_of(data: Path) -> str:
+    """What a scene is called; of `.` too."""
+    return data.resolve().name
 
 
 def hue_section(report: dict[str, Any]) -> list[str]:
@@ -139,7 +150,7 @@ def main(args: Sequence[str] | None = None) -> None:
     rows = [row for row in rows if row["code"]["sources"] == code["sources"]]
     done = {(row["scene"], row["seconds"], row["seed"], row["weight"]) for row in rows}
     wanted = product(options.scenes, [options.seconds], options.seeds, options.weights)
-    left = [each for each in wanted if (each[0].name, *each[1:]) not in done]
+    left = [each for each in wanted if (name_of(each[0]), *each[1:]) not in done]
     with ProcessPoolExecutor(options.at_once, get_context("spawn")) as pool:
         for row in pool.map(train, *zip(*left)) if left else ():
             rows.append(row)

@@ -45,7 +45,6 @@ LEARNING = (
     "folder be given here with --pipeline.model.occupancy.path (leco swap: --occupancy)"
 )
 
-SECONDS = "--pipeline.model.occupancy.seconds"
 OWN_SAMPLER = "own"
 """Name of no sampler: the host keeps its own."""
 
@@ -112,11 +111,7 @@ def say_if_another(occupancy: Occupancy, path: Path | None) -> None:
     if path is None:
         return
     with suppress(InputError):
-        file = load_occupancy(path).gate
-        if file.config != occupancy.gate.config or not all(
-            torch.equal(one.cpu(), other.cpu())
-            for one, other in zip(file.parameters(), occupancy.gate.parameters(), strict=True)
-        ):
+        if not load_occupancy(path).gate.decides_as(occupancy.gate):
             say(f"goes on with the occupancy of its checkpoint, which is not that of {path}")
 
 
@@ -151,7 +146,8 @@ class GuidedStart:
             check_budget(config.rays, config.seconds, config.rate)
             if config.learned == "along" and config.seconds is not None:
                 raise InputError(
-                    f"{SECONDS} is of learning first; a host that learns along has none"
+                    "--pipeline.model.occupancy.seconds is of learning first; a host that learns "
+                    "along has none"
                 )
         learned = guide.occupancy.gate.config if guide.occupancy is not None else None
         own, small = config.learning.sizes.gate, config.learning.sharpening.gate

@@ -120,7 +120,6 @@ def field_at_freezing(mixture: Mixture, folder: Path) -> Mixture | None:
     except (OSError, RuntimeError, ValueError, KeyError, EOFError, UnpicklingError) as error:
         line = one_line(error, 200)
         raise ValueError(f"{path} cannot be used ({line}): move it away") from None
-    gates = zip(frozen.gate.parameters(), mixture.gate.parameters(), strict=True)
-    if not all(torch.equal(one, other) for one, other in gates):
+    if not frozen.gate.decides_as(mixture.gate):
         raise ValueError(f"{path} is of another gate than the run's last checkpoint: move it away")
     return frozen.eval()

@@ -150,6 +150,13 @@ class Gate(nn.Module):
         """o(x) = 1 - G_0(x): mapped positions [N, 3] to [N] float32 in [0, 1]."""
         return occupancy_from_logits(self(mapped))
 
+    def decides_as(self, other: Gate) -> bool:
+        """Whether another gate has the same sizes and values, on whatever device."""
+        values = zip(self.parameters(), other.parameters())
+        return self.config == other.config and all(
+            torch.equal(one.cpu(), its.cpu()) for one, its in values
+        )
+
 
 def logits_of(features: Tensor, norm: nn.LayerNorm, head: nn.Linear) -> Tensor:
     """Normed features [N, width] through the last layer, to float32 whatever the precision is.
