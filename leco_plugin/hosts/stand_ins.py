@@ -20,6 +20,7 @@ from leco_plugin.models.rendering import Intervals, Rays, with_backdrop
 from leco_plugin.occupancy import SHOWN
 from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.boxes import cell_centers, intersect_box
+from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.rays import usable_rays
 from leco_plugin.samplers.registry import build_estimator, build_proposal
 from leco_plugin.scenes.frames import box_around, inverse, moved, turned
@@ -145,8 +146,12 @@ class GuidedEstimator(_StandIn):
 
     @property
     def dense(self) -> nn.Module:
-        """Keeps every candidate that the sampler behind this asks about."""
-        box = self.sampler.bounds() if isinstance(self.sampler, Estimator) else None
+        """Keeps every candidate that the sampler behind this asks about; of one that is no
+        `Estimator` and names no bounds, those within the occupancy's."""
+        sampler = self.sampler
+        if not isinstance(sampler, Estimator):
+            sampler = LearnedOccupancyEstimator(self.guide.the_occupancy(), cache_bytes=0)
+        box = sampler.bounds()
         return build_estimator("dense", aabb=box).to(self.guide.frame.device).train(self.training)
 
     def _with_an_end(self, rays_o: Tensor, rays_d: Tensor, given: dict[str, Any]) -> dict[str, Any]:

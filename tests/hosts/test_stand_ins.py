@@ -18,8 +18,10 @@ from leco_plugin.hosts import stand_ins
 from leco_plugin.hosts.guide import Guide
 from leco_plugin.hosts.host_watch import begin_carefully, end_probation
 from leco_plugin.occupancy import BACKDROP_PRICE, Occupancy
+from leco_plugin.samplers import registry
 from leco_plugin.samplers.base import Estimator
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
+from leco_plugin.samplers.registry import SamplerSpec
 from leco_plugin.space import Space
 
 pytestmark = pytest.mark.usefixtures("without_cache")
@@ -247,6 +249,35 @@ def test_a_guide_that_is_dense_for_the_moment_keeps_every_candidate(guide: Guide
     guide.the_occupancy().threshold_value.fill_(0.0)
     inside = stand_in.sampling(origins, directions, **march)[0]
     assert 0 < len(some) < len(every) and abs(len(every) - len(inside)) <= 8
+
+
+class ByComposition(torch.nn.Module):
+    """A sampler of another package that has an estimator, and is none of `Estimator`'s kind."""
+
+    def __init__(self, occupancy: Occupancy) -> None:
+        super().__init__()
+        self.inner = LearnedOccupancyEstimator(occupancy, cache_bytes=0)
+
+    def sampling(self, *args: Any, **kwargs: Any) -> Any:
+        return self.inner.sampling(*args, **kwargs)
+
+
+def test_a_sampler_that_names_no_bounds_is_compared_within_those_of_the_occupancy(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """Beyond them nerfacc's own far plane has more candidates than anybody can shade."""
+    monkeypatch.setitem(
+        registry.OURS,
+        "composed",
+        SamplerSpec("", lambda occupancy, aabb: ByComposition(occupancy), needs_occupancy=True),
+    )
+    march, dense = MARCH | {"far_plane": 1e10}, []
+    for sampler in ("learned-occupancy", "composed"):
+        guide = Guide(sampler)
+        guide.set_occupancy(copy.deepcopy(ball()))
+        guide.dense = True
+        dense.append(guide.estimator(BOX).sampling(*rays(), **march))
+    assert all(torch.equal(one, other) for one, other in zip(*dense))
 
 
 def test_the_viewer_looks_for_its_elements_before_there_is_an_occupancy():
