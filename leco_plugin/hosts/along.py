@@ -21,7 +21,7 @@ from torch import Tensor
 
 from leco_plugin.evaluation.clock import seconds_now
 from leco_plugin.hosts.guide import Guide
-from leco_plugin.hosts.host_watch import squared_errors
+from leco_plugin.hosts.host_watch import end_probation, squared_errors
 from leco_plugin.hosts.stand_ins import DEFAULTS, is_packed
 from leco_plugin.learning.calibration import (
     ERRORS,
@@ -159,6 +159,7 @@ class Along:
 
     def _teach(self, step: int) -> None:
         """Teaches and calibrates a gate; follows it where it skips more."""
+        end_probation(self.guide)  # else each threshold is tried at the lower one of the beginning
         config, before, started = self.config, self.guide.the_occupancy(), seconds_now()
         device = self.guide.frame.device
         cards = [device] if device.type == "cuda" else []

@@ -145,6 +145,22 @@ def test_what_costs_too_much_in_the_image_is_not_followed(made: Any) -> None:
     assert not list(made.out.iterdir())
 
 
+def test_a_gate_is_measured_at_its_own_threshold_in_a_host_that_still_follows_a_lower_one(
+    made: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where a file is given, and the first measurement comes after the first lesson."""
+    guide, errors, followed = made.guide, made.teacher._errors, []
+
+    def noting(*given: Any) -> Tensor:
+        followed.append((guide.followed().threshold, guide.the_occupancy().threshold))
+        return errors(*given)
+
+    monkeypatch.setattr(made.teacher, "_errors", noting)
+    guide.watched.lower = 2.0 * OPEN
+    made.teacher._teach(1)
+    assert len(followed) > 1 and all(one == other for one, other in followed)
+
+
 def test_a_gate_leaves_half_of_what_is_not_spent_and_nothing_where_more_is(made: Any) -> None:
     config = made.teacher.config.calibration
     spent = {"lost_surface_mass": None, "image_price_db": 2.0 * config.image_price_db}
