@@ -87,8 +87,10 @@ def _ending_in_a_backdrop(
     ends = rays_o.new_full((len(rays_o),), float(options["far_plane"]))
     ends = ends if options["t_max"] is None else ends.minimum(options["t_max"])
     enters, leaves = intersect_box(rays_o, rays_d, walls)
-    ends = torch.where(leaves > enters.clamp(min=0.0), leaves.minimum(ends), ends)
     begins = torch.full_like(ends, float(options["near_plane"]))
+    begins = begins if options["t_min"] is None else begins.maximum(options["t_min"])
+    meets = leaves > enters.maximum(begins).clamp(min=0.0)
+    ends = torch.where(meets, leaves.minimum(ends), ends)
     rays = within_crop(Rays(rays_o, rays_d, begins, ends, None, cut_off), *crop)
     ended = with_backdrop(
         Intervals(*samples), rays, options["render_step_size"], options["cone_angle"]
@@ -124,7 +126,8 @@ class GuidedEstimator(_StandIn):
         crop: tuple[Tensor | None, Tensor | None] = (None, None)
         if guide.cropped:
             crop = given.get("t_min"), given.get("t_max")
-            uncropped = self._with_an_end(rays_o, rays_d, given | {"t_max": None})
+            limitless = given | {"t_min": None, "t_max": None}
+            uncropped = self._with_an_end(rays_o, rays_d, limitless)
         if not guide.same_frame():
             # a direction carries the scale, so that distances along the ray stay the host's
             frame = guide.frame.to(rays_o)

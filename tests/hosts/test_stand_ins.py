@@ -307,3 +307,16 @@ def test_the_backdrop_of_a_ray_whose_back_is_to_the_scene_lies_at_its_end() -> N
     assert of_rays.tolist() == [0, 1, 2]
     torch.testing.assert_close(ends, torch.tensor([4.0, 9.0, 9.0]))
     torch.testing.assert_close(starts, ends - 0.5)
+
+
+def test_the_backdrop_of_a_ray_that_begins_behind_the_walls_lies_at_its_end() -> None:
+    """One that leaves them later ends there; one that ends before it begins has none."""
+    origins, directions = torch.zeros(3, 3), torch.tensor([[1.0, 0.0, 0.0]]).expand(3, 3)
+    nothing = torch.zeros(0, dtype=torch.int64), torch.zeros(0), torch.zeros(0)
+    limits = {"t_min": torch.tensor([2.0, 0.2, 6.0]), "t_max": torch.full((3,), 5.0)}
+    walls = torch.tensor([-1.0] * 3 + [1.0] * 3)
+    of_rays, starts, ends = stand_ins._ending_in_a_backdrop(
+        nothing, origins, directions, limits | {"render_step_size": 0.5}, walls, (None, None), None
+    )
+    assert of_rays.tolist() == [0, 1] and ends.tolist() == [5.0, 1.0]
+    torch.testing.assert_close(starts, ends - 0.5)
