@@ -217,6 +217,11 @@ def check_poses(poses: NDArray[np.floating], names: list[str]) -> None:
     if broken.any():
         worst = names[int(broken.argmax())]
         raise InputError(f"{worst} is no finite 4 x 4 matrix: mend it, or leave its image out")
+    transposed = poses[:, 3:, :3].any(axis=(1, 2))
+    if transposed.any():
+        worst = names[int(transposed.argmax())]
+        remedy = "transpose it where it is listed by columns: the last row is 0, 0, 0, 1"
+        raise InputError(f"{worst} has its place in the last row: {remedy}")
     with np.errstate(over="ignore", invalid="ignore"):
         distances = np.nan_to_num(distance_from_rotations(poses[:, :3, :3]), nan=np.inf)
     if distances.max() > SKEW:

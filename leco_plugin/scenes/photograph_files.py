@@ -324,10 +324,12 @@ def seen_pixels(mask: Path, image: Path, size: tuple[int, int]) -> NDArray[np.bo
 
 def _found(path: Path, image: Path) -> Path:
     """The file of a mask: of full size where there is no smaller one, or named as COLMAP does."""
-    folders = [path.parent]
-    for place, part in enumerate(path.parts[:-1]):
-        if smaller := re.fullmatch(r"(.+)_\d+", part):
-            folders.append(Path(*path.parts[:place], smaller[1], *path.parts[place + 1 : -1]))
+    folders, parts = [path.parent], path.absolute().parts[:-1]
+    # what both lie in is the scene, and SCENE_2 no smaller copy of SCENE
+    own = len(Path(os.path.commonpath([path.absolute(), image.absolute()])).parts)
+    for place in range(own, len(parts)):
+        if smaller := re.fullmatch(r"(.+)_\d+", parts[place]):
+            folders.append(Path(*parts[:place], smaller[1], *parts[place + 1 :]))
     for folder in folders:
         for name in (path.name, f"{image.name}.png", f"{image.stem}.png"):
             if (folder / name).is_file():

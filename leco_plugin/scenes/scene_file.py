@@ -34,6 +34,8 @@ from leco_plugin.scenes.whole_files import begins_with
 FRAMES = ("frames", "test_frames")
 """Lists of frames; the second is ScanNet++'s."""
 NO_SCENE = (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
+ROUNDED = 1e-9
+"""Of the largest coordinate, how far cameras of one place may be apart by rounding: UTM's 5 mm."""
 MAKE_ANEW = "make it anew from the photographs, with leco poses or ns-process-data"
 
 
@@ -131,7 +133,8 @@ def read_scene_file(path: Path, split: str, folder: Path) -> SceneFile:
     of_each = [f"{path}: the transform_matrix of {name}" for name in names]
     check_poses(poses, of_each)
     check_no_contradiction(poses, of_each)
-    if split == "train" and np.ptp(poses[:, :3, 3], axis=0).max() == 0.0:
+    positions = poses[:, :3, 3]
+    if split == "train" and np.ptp(positions, axis=0).max() <= ROUNDED * np.abs(positions).max():
         number = "one image" if len(frames) == 1 else f"{len(frames)} images from one place"
         raise InputError(f"{path} has {number}: add photographs from two places at least")
     lenses = [lens_of(meta, frame, f"{path}: {frame['file_path']}") for frame in frames]

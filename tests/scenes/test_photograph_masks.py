@@ -94,6 +94,15 @@ def test_a_smaller_mask_is_made_of_the_one_of_full_size(tmp_path: Path) -> None:
         np.testing.assert_array_equal(seen, SEEN[::2, ::2])
 
 
+def test_a_mask_of_another_scene_is_not_taken_for_one_of_full_size(tmp_path: Path) -> None:
+    """As of `yard`, which lies beside `yard_2`."""
+    (tmp_path / "yard/masks").mkdir(parents=True)
+    WHITE.save(tmp_path / "yard/masks/b.png")
+    scene, derived = tmp_path / "yard_2", DerivedImages(tmp_path / "cache")
+    with refused("yard_2/masks/b.png is not there"):
+        convert_masks([scene / "masks/b.png"], [scene / "b.jpg"], [(24, 16)], derived, False)
+
+
 def test_progress_is_shown_for_each_mask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shares: list[float] = []
 

@@ -46,10 +46,15 @@ def set_pose(value: Any) -> Callable[[dict[str, Any]], None]:
     return lambda meta: meta["frames"][1].update(transform_matrix=value)
 
 
-def stand_still(meta: dict[str, Any]) -> None:
-    for frame in meta["frames"]:
+def stand_still(meta: dict[str, Any], rounded_by: float = 0.0) -> None:
+    for number, frame in enumerate(meta["frames"]):
         for row in frame["transform_matrix"][:3]:
-            row[3] = 0.5
+            row[3] = 0.5 + number * rounded_by
+
+
+def transpose(meta: dict[str, Any]) -> None:
+    for frame in meta["frames"]:
+        frame["transform_matrix"] = [*map(list, zip(*frame["transform_matrix"]))]
 
 
 def add_masks(scene: Path, values: list[int]) -> None:
@@ -123,6 +128,11 @@ BAD_MEASURES: dict[str, tuple[Callable[[Path], object], str]] = {
         "has one image: add photographs from two places",
     ),
     "a panorama": (lambda s: change(s, stand_still), "has 9 images from one place"),
+    "a panorama but for rounding": (
+        lambda s: change(s, lambda m: stand_still(m, 1e-15)),
+        "has 9 images from one place",
+    ),
+    "poses by columns": (lambda s: change(s, transpose), "000.png has its place in the last row"),
     "masks for some images": (
         lambda s: (add_masks(s, [255] * 9), change(s, lambda m: m["frames"][0].pop("mask_path"))),
         "8 of 9 images have a mask_path",
