@@ -156,7 +156,7 @@ def _is_missing(path: Path) -> bool:
     return False
 
 
-def remedy_for_missing(path: Path) -> str:
+def remedy_for_missing(path: Path, otherwise: str = "put it there, or leave its frame out") -> str:
     """What to add to a line about a file that is missing: why it may be, and what to do."""
     if "\\" in str(path):
         return ": its name was written by Windows, write / for each backslash"
@@ -179,7 +179,7 @@ def remedy_for_missing(path: Path) -> str:
                 f": there is {name}, and nerfstudio reads names in COLMAP's .txt files up to a "
                 "blank: give its .bin files, or names without blanks"
             )
-    return ": put it there, or leave its frame out"
+    return f": {otherwise}"
 
 
 def check_kind(path: Path, header: Header) -> None:
@@ -324,12 +324,14 @@ def seen_pixels(mask: Path, image: Path, size: tuple[int, int]) -> NDArray[np.bo
 
 def _found(path: Path, image: Path) -> Path:
     """The file of a mask: of full size where there is no smaller one, or named as COLMAP does."""
-    folders, parts = [path.parent], path.absolute().parts[:-1]
+    parts = path.absolute().parts[:-1]
     # what both lie in is the scene, and SCENE_2 no smaller copy of SCENE
     own = len(Path(os.path.commonpath([path.absolute(), image.absolute()])).parts)
-    for place in range(own, len(parts)):
-        if smaller := re.fullmatch(r"(.+)_\d+", parts[place]):
-            folders.append(Path(*parts[:place], smaller[1], *parts[place + 1 :]))
+    folders = [path.parent] + [
+        Path(*parts[:place], smaller[1], *parts[place + 1 :])
+        for place in range(own, len(parts))
+        if (smaller := re.fullmatch(r"(.+)_\d+", parts[place]))
+    ]
     for folder in folders:
         for name in (path.name, f"{image.name}.png", f"{image.stem}.png"):
             if (folder / name).is_file():

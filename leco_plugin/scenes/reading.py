@@ -154,7 +154,11 @@ def _remedy(error: BaseException, config: Any) -> str:
         return f"it would make smaller copies of photographs of more than 1600 pixels: {command}"
     if "list of filenames for split" in str(error):
         lists = "train_filenames, val_filenames and test_filenames"
+        if name == "colmap":
+            lists = f"train_list.txt, val_list.txt and test_list.txt in {data}"
         return f"list photographs in each of {lists}, or remove these lists"
+    if name == "colmap" and "Some filenames for split" in str(error):
+        return "in its _list.txt, write each as its model has it, and leave no line empty"
     if "camera model" in _reason(error).lower():
         return "undistort the photographs with `colmap image_undistorter`, and give that model"
     if re.search(r"\w\\{1,2}\w", str(error)):
@@ -171,7 +175,11 @@ def _remedy(error: BaseException, config: Any) -> str:
     if isinstance(error, UnidentifiedImageError):
         return photograph_files.SAVE_ANEW
     if isinstance(error, FileNotFoundError | NotADirectoryError):
-        return "put that file there, or remove what names it"
+        missing, otherwise = (
+            Path(error.filename or data),
+            "put that file there, or remove what names it",
+        )
+        return photograph_files.remedy_for_missing(missing, otherwise)[2:]
     file = description_of(config, "train") or data / getattr(config, "colmap_path", "")
     if isinstance(error, KeyError):
         return f"add {one_line(error, 40)} to {file}"

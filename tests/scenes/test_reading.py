@@ -638,6 +638,17 @@ def test_what_colmap_lacks_has_its_own_remedy(scene: Path) -> None:
     with refused(r"images/000\.png'; name the folder .*--images-path"):
         read(config)
     (scene / "input").rename(scene / "images")
+    (scene / "train_list.txt").write_text("000.png\n\n")
+    with refused("were not found.*; in its _list.txt, .* leave no line empty"):
+        read(config)
+    (scene / "train_list.txt").rename(scene / "test_list.txt")
+    with refused("each of train_list.txt, val_list.txt and test_list.txt in "):
+        read(config)
+    (scene / "test_list.txt").unlink()
+    (scene / "images/000.png").rename(scene / "images/000.PNG")
+    with refused(r"images/000\.png'; there is 000\.PNG, write its name like that"):
+        read(config)
+    (scene / "images/000.PNG").rename(scene / "images/000.png")
     of_images = scene / "sparse/0/images.txt"
     of_images.write_text("".join(of_images.read_text().splitlines(keepends=True)[:2]))
     with refused("; add photographs: a scene is seen from two places"):
