@@ -7,8 +7,10 @@ is read wrongly is looked for in what they return.
 from __future__ import annotations
 
 import functools
+import math
 import re
 from collections import Counter
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -43,6 +45,14 @@ from leco_plugin.studio.checkpoints import require_data
 SAVE_ALIKE = "save all with an alpha channel or none"
 UNWRITABLE = "make the folder of the scene writable, or convert its pictures and masks by hand"
 
+OPTIONS: dict[str, tuple[Callable[[float], bool], str]] = {
+    "downscale_factor": (lambda value: value > 0, "1 or more"),
+    "scale_factor": (lambda value: 0.0 < value < math.inf, "a positive number"),
+    "train_split_fraction": (lambda value: 0.0 <= value <= 1.0, "from 0 to 1"),
+    "eval_interval": (lambda value: value > 0, "1 or more"),
+}
+"""Of readers, by name: whether a value is right, and what is."""
+
 
 class CheckedReader(DataParser):
     """Stands before a reader among a class's bases: outputs are checked, errors are one line."""
@@ -56,8 +66,9 @@ class CheckedReader(DataParser):
         """As the reader's. InputError, in one line, for whatever goes wrong."""
         config: Any = self.config
         require_data(Path(config.data))
-        factor = getattr(config, "downscale_factor", None)
-        require(factor is None or factor > 0, "downscale_factor", factor, "1 or more")
+        for option, (is_right, wanted) in OPTIONS.items():
+            value = getattr(config, option, None)
+            require(value is None or is_right(value), option, value, wanted)
         scene = scene_file.scene_file_of(config, split)
         try:
             read = super().get_dataparser_outputs(split=split, **options)

@@ -628,8 +628,23 @@ def test_a_list_that_names_no_frame_is_said(listed: Any, message: str, scene: Pa
     for config in (LecoPhotographsDataParserConfig, NerfstudioDataParserConfig):
         with refused(message):
             read(config(data=scene))
-    with refused("downscale_factor is 0; it must be 1 or more"):
-        read(LecoPhotographsDataParserConfig(data=scene, downscale_factor=0))
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "wanted"),
+    [
+        ("downscale_factor", 0, "1 or more"),
+        ("scale_factor", 0.0, "a positive number"),
+        ("scale_factor", -1.0, "a positive number"),
+        ("train_split_fraction", 1.5, "from 0 to 1"),
+        ("eval_interval", 0, "1 or more"),
+    ],
+)
+def test_an_option_of_a_reader_is_a_size_or_a_share(
+    option: str, value: float, wanted: str, scene: Path
+) -> None:
+    with refused(f"^{option} is {value}; it must be {wanted}$"):
+        read(LecoPhotographsDataParserConfig(data=scene, **{option: value}))
 
 
 def test_what_colmap_lacks_has_its_own_remedy(scene: Path) -> None:
