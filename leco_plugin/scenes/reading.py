@@ -40,6 +40,7 @@ from leco_plugin.scenes.photograph_files import (
     is_plain,
 )
 from leco_plugin.scenes.scene_file import SceneFile, command_with, description_of
+from leco_plugin.scenes.whole_files import FETCH, is_pointer
 from leco_plugin.studio.checkpoints import require_data
 
 SAVE_ALIKE = "save all with an alpha channel or none"
@@ -70,6 +71,7 @@ class CheckedReader(DataParser):
             value = getattr(config, option, None)
             require(value is None or is_right(value), option, value, wanted)
         scene = scene_file.scene_file_of(config, split)
+        _refuse_pointers(config)
         try:
             read = super().get_dataparser_outputs(split=split, **options)
             outputs = checked(read, config, split, scene)
@@ -126,6 +128,15 @@ def reader_name(config: Any) -> str:
 
     names = [name for name, known in all_dataparsers.items() if type(known) is type(config)]
     return names[0] if names else type(config).__name__
+
+
+def _refuse_pointers(config: Any) -> None:
+    """InputError for a file of a COLMAP model, or a picture of it, that Git LFS has not fetched."""
+    folders = [getattr(config, name, None) for name in ("colmap_path", "images_path")]
+    for folder in (Path(config.data) / each for each in folders if each is not None):
+        for path in sorted(folder.glob("*")):
+            if is_pointer(path):
+                raise InputError(f"{path} {FETCH}")
 
 
 def _check_lists(scene: SceneFile) -> None:

@@ -29,7 +29,7 @@ from leco_plugin.scenes.lenses import (
 )
 from leco_plugin.scenes.photograph_files import find_file
 from leco_plugin.scenes.poses import ASKED
-from leco_plugin.scenes.whole_files import begins_with
+from leco_plugin.scenes.whole_files import FETCH, begins_with, is_pointer
 
 FRAMES = ("frames", "test_frames")
 """Lists of frames; the second is ScanNet++'s."""
@@ -109,6 +109,8 @@ def poses_in(frames: list[dict[str, Any]]) -> NDArray[np.float64]:
 
 def not_a_scene(path: Path, error: BaseException) -> InputError:
     """What to raise for a transforms.json that cannot be read as one: one of `NO_SCENE`."""
+    if is_pointer(path):
+        return InputError(f"{path} {FETCH}")
     reason = f"{type(error).__name__}: {one_line(error, 120)}"
     fault = f"{path} is not a scene in nerfstudio's format ({reason})"
     return InputError(f"{fault}; mend it, or {MAKE_ANEW}")
@@ -130,7 +132,7 @@ def read_scene_file(path: Path, split: str, folder: Path) -> SceneFile:
     if len(frames) == 0:
         fault = "has no cameras: its list of frames is empty"
         raise InputError(f"{path} {fault}; {MAKE_ANEW}")
-    of_each = [f"{path}: the transform_matrix of {name}" for name in names]
+    of_each = [f"{path}: the transform_matrix of {Path(name)}" for name in names]  # without ./
     check_poses(poses, of_each)
     check_no_contradiction(poses, of_each)
     positions = poses[:, :3, 3]

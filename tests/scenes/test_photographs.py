@@ -52,6 +52,11 @@ def stand_still(meta: dict[str, Any], rounded_by: float = 0.0) -> None:
             row[3] = 0.5 + number * rounded_by
 
 
+def repeat(meta: dict[str, Any]) -> None:
+    """A photograph under another spelling, with the pose of another one."""
+    meta["frames"].append(meta["frames"][1] | {"file_path": "./images/000.png"})
+
+
 def transpose(meta: dict[str, Any]) -> None:
     for frame in meta["frames"]:
         frame["transform_matrix"] = [*map(list, zip(*frame["transform_matrix"]))]
@@ -131,6 +136,10 @@ BAD_MEASURES: dict[str, tuple[Callable[[Path], object], str]] = {
     "a panorama but for rounding": (
         lambda s: change(s, lambda m: stand_still(m, 1e-15)),
         "has 9 images from one place",
+    ),
+    "a photograph twice, by two spellings": (
+        lambda s: change(s, repeat),
+        "images/000.png is given twice, and differs",
     ),
     "poses by columns": (lambda s: change(s, transpose), "000.png has its place in the last row"),
     "masks for some images": (

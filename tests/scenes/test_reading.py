@@ -647,6 +647,15 @@ def test_an_option_of_a_reader_is_a_size_or_a_share(
         read(LecoPhotographsDataParserConfig(data=scene, **{option: value}))
 
 
+def test_what_git_lfs_has_not_fetched_is_named(scene: Path) -> None:
+    config, pointer = as_colmap(scene), "version https://git-lfs.github.com/spec/v1\n"
+    for name in ("transforms.json", "images/003.png", "sparse/0/points3D.bin"):
+        (scene / name).write_text(pointer)
+        with refused(f"{name} is a pointer of Git LFS: `git lfs pull` fetches"):
+            read(LecoPhotographsDataParserConfig(data=scene) if "json" in name else config)
+        (scene / name).unlink()
+
+
 def test_what_colmap_lacks_has_its_own_remedy(scene: Path) -> None:
     config = as_colmap(scene)
     (scene / "images").rename(scene / "input")
