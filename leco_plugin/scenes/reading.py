@@ -253,7 +253,7 @@ def checked(
         if speak:
             scene_file.say_unused(scene.meta, scene.path, cameras.times is not None)
     made = torch.cat([cameras.width, cameras.height], dim=-1).expand(len(images), -1).tolist()
-    sizes = [_size_of(*each, factor) for each in zip(images, headers, lenses, made)]
+    sizes = [size_of(*each, factor) for each in zip(images, headers, lenses, made)]
     cameras.width, cameras.height = torch.tensor(sizes).to(cameras.width).split(1, dim=1)
     set_lenses(cameras, lenses, factor)
     _check_focal_lengths(cameras, images)
@@ -279,7 +279,7 @@ def _check_focal_lengths(cameras: Cameras, images: list[Path]) -> None:
                 raise InputError(f"{fault}: mend the intrinsics in the files of the scene")
 
 
-def _size_of(
+def size_of(
     path: Path, header: Header, lens: Lens | None, wanted: list[int], factor: int
 ) -> tuple[int, int]:
     """Width and height of a picture as it will be read. InputError unless they are those of its

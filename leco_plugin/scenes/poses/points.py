@@ -31,6 +31,7 @@ from leco_plugin.scenes.poses.reconstruction import (
     load_pycolmap,
     require_disk,
 )
+from leco_plugin.scenes.reading import size_of
 from leco_plugin.scenes.scene_file import SceneFile, poses_in
 from leco_plugin.scenes.whole_files import check_place, write_json, write_whole
 
@@ -73,7 +74,9 @@ def find_points(data: Path, size: int = 1600, threads: int = 0) -> dict[str, Any
     poses[:, :, 3] -= centre
     with tempfile.TemporaryDirectory() as work:
         pictures = scene.pictures()
-        sides = [min(size, max(header_of(pictures[number]).size)) for number in chosen]
+        given = ((pictures[n], header_of(pictures[n]), scene.lenses[n]) for n in chosen)
+        sizes = [size_of(path, header, lens, [*header.size], 1) for path, header, lens in given]
+        sides = [min(size, max(each)) for each in sizes]
         needed = sum(BYTES_A_SQUARE * side**2 for side in sides)
         require_disk(Path(work), len(chosen), needed, "TMPDIR")
         copies = _copies(scene, chosen, Path(work) / "images", size)

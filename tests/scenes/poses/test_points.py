@@ -14,7 +14,7 @@ import torch
 from nerfstudio.cameras.cameras import CameraType
 from PIL import Image
 from rendered_survey import BLOCKS
-from scene_files import change, described, read_ply
+from scene_files import change, described, read_ply, refused
 
 from leco_plugin import cli
 from leco_plugin.scenes.input_error import InputError
@@ -126,6 +126,15 @@ def test_poses_of_other_photographs_are_refused_and_nothing_is_written(few: Path
 def test_photographs_that_share_too_little_are_refused(pycolmap: Any, tiny_scene: Path) -> None:
     with pytest.raises(InputError, match="too few for points: add photographs between them"):
         find_points(tiny_scene, threads=1)
+
+
+def test_photographs_of_another_size_than_their_intrinsics_are_refused(
+    pycolmap: Any, scene: Path
+) -> None:
+    """As training refuses them."""
+    Image.new("RGB", (16, 16)).save(scene / "images/001.png")
+    with refused("001.png has 16 x 16 pixels, its intrinsics are for 32 x 32"):
+        find_points(scene, threads=1)
 
 
 def test_photographs_for_tests_are_left_out() -> None:
