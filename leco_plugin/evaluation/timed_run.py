@@ -37,6 +37,7 @@ from leco_plugin.on_cpu import in_float64
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.pixels.held_out_pixels import visible_in_test
 from leco_plugin.studio.host_models import leave_out_the_end, true_colours
+from leco_plugin.studio.run_folder import ENDLESS
 
 RAYS_AT_ONCE = 1024
 """Test rays rendered at a time: few, so that an evaluation does not set the peak memory."""
@@ -46,8 +47,6 @@ CURVE_RAYS = 8192
 PRICES = ("threshold", "empty_fraction", "lost_mass", "lost_surface_mass", "image_price_db")
 RECENT = 100
 """Steps by which it is foreseen how many are left."""
-ENDLESS = 10_000_000
-"""Steps that no run reaches before its time is over."""
 
 
 @dataclass
@@ -284,13 +283,14 @@ class _Course:
         return True
 
     def _foresee_the_end(self) -> None:
-        """For a model that learns itself, which sharpens its gate towards the end."""
+        """For a model that learns itself: how long, and when it sharpens its gate, is its share of
+        a run."""
         seconds, steps, config = self.budget.seconds, self.run.steps, self.trainer.config
         mixture = getattr(self.model, "mixture", None)
         if seconds is None or mixture is None:
             return
         config.max_num_iterations = self.budget.steps or ENDLESS
-        if bool(mixture.frozen) and self.step_times:
+        if self.step_times:
             left = (seconds - self.clock.seconds) / statistics.fmean(self.step_times[-RECENT:])
             foreseen = steps + math.ceil(max(0.0, left))
             config.max_num_iterations = min(config.max_num_iterations, foreseen)

@@ -17,6 +17,7 @@ from leco_plugin.learning.calibration import (
     Measured,
     backdrop_price,
     calibrate,
+    measure,
     promise,
     ray_prices,
 )
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
 
 OF_SURFACES = ("lost_surface_mass", "lost_mass", "surface_error")
 """What a report says of lost weight: the haze of a restarted field falsifies it."""
+CAREFUL = 0.25
+"""Share of its calibrated threshold at which a learned gate skips until a small one follows it."""
 
 
 class HeldOut(PriceSource):
@@ -64,8 +67,13 @@ class HeldOut(PriceSource):
         return self.data.of_vouching(self.mixture, self.config.cameras, self.config.camera_rays)
 
     @torch.no_grad()
-    def price(self) -> tuple[Measured, dict[str, Any]]:
-        """The threshold to freeze at, within the bounds, and what a report says of it."""
+    def price(self, careful: bool = False) -> tuple[Measured, dict[str, Any]]:
+        """The threshold to freeze at, within the bounds, and what a report says of it.
+
+        Args:
+            careful: whether to skip less than the bounds allow: what is skipped while the field is
+                haze, it does not find later.
+        """
         mixture, config = self.mixture, self.config
         rays, truth = self.rays(config.rays)
         cameras = self.cameras()
@@ -73,6 +81,8 @@ class HeldOut(PriceSource):
             rendering = dense_rendering(mixture, rays, truth, config.rays_at_once)
             of_cameras = [dense_reference(mixture, of_one) for of_one, _ in cameras]
             measured = calibrate(rendering, config, cameras=of_cameras)
+            if careful:
+                measured = measure(rendering, CAREFUL * measured.threshold)
             of_backdrop = backdrop_price(rendering)
             rendered = torch.cat([reference.rgb for reference in rendering.references])
         rule, region = mixture.rule(), mixture.region

@@ -35,6 +35,7 @@ from leco_plugin.learning.schedule import (
     decisions_agree,
     is_unsettled,
     schedule_since,
+    steps_in,
     steps_of_an_extension,
 )
 from leco_plugin.log import note, say, say_all, summarize
@@ -172,9 +173,14 @@ class Learner:
             seconds: that the step took.
             kept: samples a ray that the frozen gate kept of the batch, backdrops excluded.
         """
-        if self.past_learning or self.config.homogeneous:
+        if self.past_learning:
             return
-        if self.mixture.is_frozen:
+        schedule, frozen = self.config.schedule, self.mixture.is_frozen
+        if not frozen and (step + 1) % schedule.steps_per_check == 0:
+            self.progress.lengthen(schedule.learn_steps, steps_in(self.run.end, schedule))
+        if self.config.homogeneous:
+            return
+        if frozen:
             self._watch(step, seconds, kept)
             if self._is_time_to_sharpen(step):
                 self._sharpen(step)
@@ -182,7 +188,7 @@ class Learner:
             self.progress.learn_seconds += seconds
             self._after_learning_step(step)
         ends_unfrozen = step + 1 >= self.run.end and not self.mixture.is_frozen
-        if self.config.schedule.freeze and ends_unfrozen:
+        if schedule.freeze and ends_unfrozen:
             say(
                 f"step {step}: the run ends while its occupancy is still learned, to step "
                 f"{self.progress.learn_steps}, and nothing is frozen; go on from its checkpoint "
@@ -248,7 +254,8 @@ class Learner:
         mixture, progress, schedule = self.mixture, self.progress, self.config.schedule
         share(mixture.gate.state_dict().values())
         seconds = round(progress.learn_seconds, 2)
-        found = from_first(lambda: (*self.held_out.price(), seconds), mixture.device)
+        careful = self._may_sharpen(after=step)
+        found = from_first(lambda: (*self.held_out.price(careful), seconds), mixture.device)
         measured, report, seconds = found
         report |= {"step": step, "train_seconds": seconds, "recoveries": progress.recoveries}
         mixture.freeze(measured.threshold, report)
@@ -277,15 +284,20 @@ class Learner:
             say("the field starts anew, guided from its first step")
         self.run.save(step)  # a run killed from now on stays frozen
 
+    def _may_sharpen(self, after: int) -> bool:
+        """Whether a small gate follows one that guides from step `after` on: the field has to be
+        guided for long enough by then. A gate that is learned alone is not sharpened."""
+        config, when = self.config.sharpening, SHARPENED_FROM * self.run.end
+        return config.steps > 0 and self.run.goes_on and when - after >= config.least_steps
+
     def _is_time_to_sharpen(self, step: int) -> bool:
         """Whether so much of the run is over, and the field was guided for long enough by then,
         since freezing or the last time."""
-        mixture, config, when = self.mixture, self.config.sharpening, SHARPENED_FROM * self.run.end
-        if config.steps == 0 or step + 1 < when or not mixture.is_frozen:
+        last, when = self.progress.sharpened_at, SHARPENED_FROM * self.run.end
+        now = step + 1 >= when > last + 1  # once in a run, however few steps are enough
+        if not now or self.config.sharpening.steps == 0 or not self.mixture.is_frozen:
             return False
-        last = self.progress.sharpened_at
-        enough = when - max(last, mixture.report["step"]) >= config.least_steps
-        return enough and last + 1 < when  # once in a run, however few are enough
+        return self._may_sharpen(after=max(last, self.mixture.report["step"]))
 
     def _sharpen(self, step: int) -> None:
         """Has a small gate skip in place of the learned one where it skips more, and says so."""

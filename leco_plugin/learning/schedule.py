@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 from torch import Tensor
@@ -13,6 +14,9 @@ KEPT_ABOVE = 0.1
 """o(x) from which a sample counts as kept before there is a calibrated threshold."""
 MOST_EXTENSIONS = 2
 """How often a gate that has not settled is given more steps."""
+
+LONGEST = 4
+"""Times `learn_steps` that a long run learns for at most: longer phases were not tried."""
 
 RATES = {"encoding": 2e-2, "field": 1e-2, "gate": 5e-3}
 """Learning rates of `leco-occupancy` for each of its parameter groups."""
@@ -36,6 +40,9 @@ class ScheduleConfig:
     what it has learned."""
     learn_steps: int = 200
     """Steps after which the gate is frozen even if a few of its decisions still change."""
+    learn_share: float = 0.0
+    """Share of a run that its gate is learned in where that is more than `learn_steps`, up to four
+    times as many; from 0 to 0.5."""
     settled: float = 0.92
     """Share of probe positions whose decision must be the same in the last two checks; else the
     gate learns on for a quarter of `learn_steps`, at most twice."""
@@ -61,6 +68,8 @@ class ScheduleConfig:
         for name in ("settled", "earliest", "ramp_from", "ramp_to", "agreement"):
             share = getattr(self, name)
             require(0.0 <= share <= 1.0, f"schedule.{name.replace('_', '-')}", share, "from 0 to 1")
+        share = self.learn_share
+        require(0.0 <= share <= 0.5, "schedule.learn-share", share, "from 0 to 0.5")
         start, end = self.ramp_from, self.ramp_to
         require(start <= end, "schedule.ramp-from", start, f"at most ramp-to, {end}")
         every = self.steps_per_record
@@ -83,6 +92,12 @@ def converged(step: int, agreement: float, config: ScheduleConfig) -> bool:
     share of probe decisions equal to those of the check before, 0 at the first."""
     early = step + 1 < config.earliest * config.learn_steps
     return step + 1 >= config.learn_steps or (not early and agreement >= config.agreement)
+
+
+def steps_in(end: float, config: ScheduleConfig) -> int:
+    """Steps of the first phase in a run of `end` steps, infinite where nobody knows how many."""
+    share = config.learn_share * end if math.isfinite(end) else 0.0
+    return int(min(max(config.learn_steps, share), LONGEST * config.learn_steps))
 
 
 def steps_of_an_extension(learn_steps: int) -> int:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import atexit
 import functools
 import inspect
+import math
 import os
 import re
 from dataclasses import replace
@@ -150,6 +151,8 @@ def _with_model(config: Any, model: Any) -> Any:
     return replace(config, pipeline=replace(config.pipeline, model=model))
 
 
+ENDLESS = 10_000_000
+"""Steps of a run that ends by its time: no run makes so many."""
 COUNTED_FROM_ZERO = re.compile(
     r"max_num_iterations\s*-\s*self\._start_step"
     r"|range\(\s*self\._start_step\s*,\s*self\.config\.max_num_iterations\s*\)"
@@ -206,7 +209,8 @@ class TrainerRun:
     @property
     def end(self) -> float:
         """Of the trainer's config as it is now: a run of fixed time knows it only on the way."""
-        return float(end_of(self.trainer.config, self.trainer._start_step))
+        end = end_of(self.trainer.config, self.trainer._start_step)
+        return float(end) if end < ENDLESS else math.inf
 
     def optimizers(self) -> list[Optimizer]:
         """Those of all parameter groups."""

@@ -381,15 +381,15 @@ ENDLESS = module.ENDLESS
 @pytest.mark.parametrize(
     ("recent", "frozen_after", "seconds", "ends"),
     [
-        # nothing is known before the fourth step, which leaves 11 s for steps of 2 s each, nor when
-        # the gate learns again
-        (None, range(2, 5), (9, 9, 9, 2, 4, 4, 3), [*[ENDLESS] * 4, 4 + 6, 5 + 3, ENDLESS]),
+        # while the gate learns 31 s and 22 s are left for steps of 9 s; guided steps are others,
+        # and the first of them leaves 11 s for steps of 2 s each
+        (None, range(2, 5), (9, 9, 9, 2, 4, 4, 3), [ENDLESS, 5, 5, ENDLESS, 4 + 6, 5 + 3, 6 + 1]),
         # 33 s and 27 s are left for steps of 6 s, 23 s for those of 5, then 19 s and 15 s for those
         # of 4, and 6 s for those of 6.5
         (2, range(9), (1, 6, 6, 4, 4, 4, 9, 9), [*[ENDLESS] * 2, 8, 8, 9, 10, 10, 8]),
         (None, range(3, 9), (9, 9, 9, 9, 2, 1, 1), None),
     ],
-    ids=["while it is frozen", "by the latest steps", "after freezing"],
+    ids=["learning and guided", "by the latest steps", "after freezing"],
 )
 def test_a_model_that_learns_itself_knows_its_last_step(
     recent: int | None, frozen_after: range, seconds: Any, ends: Any, a_run: Any, monkeypatch: Any

@@ -14,7 +14,7 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from small_learner import SMALLEST, NoPixels, small_mixture
 
-from leco_plugin.learning.calibration import CalibrationConfig
+from leco_plugin.learning.calibration import CalibrationConfig, measure
 from leco_plugin.learning.dense import dense_reference, dense_rendering, evaluating
 from leco_plugin.learning.held_out import HeldOut
 from leco_plugin.learning.quality import FIELD, ONE_COLOUR
@@ -141,6 +141,23 @@ def test_a_report_has_the_psnr_of_the_field_and_of_one_colour_on_the_rays_of_cal
     assert report["calibration_rays"] == 9
     assert (report["near"], report["far"], report["aabb"]) == (0.5, 2.0, [-100.0] * 3 + [100.0] * 3)
     assert (report["step_size"], report["cone_angle"]) == mixture.rule()
+
+
+def test_a_careful_price_is_that_of_a_quarter_of_the_threshold() -> None:
+    """What the report says is what is skipped then."""
+    torch.manual_seed(0)
+    mixture, truth, data = small_mixture(), torch.rand(9, 3), NoPixels()
+    rays = mixture.rays(data.survey.origins, data.survey.directions, None)
+    data.held_out = lambda *_: (rays, truth)  # type: ignore[method-assign]
+    anything = CalibrationConfig(lost_surface_mass=1.0, image_price_db=99.0)
+    held_out = HeldOut(mixture, data, anything, restarted=False)  # type: ignore[arg-type]
+    (full, _), (careful, report) = held_out.price(), held_out.price(careful=True)
+    assert 0.0 < careful.threshold == 0.25 * full.threshold
+    with evaluating(mixture), torch.no_grad():
+        rendering = dense_rendering(mixture, rays, truth, anything.rays_at_once)
+        assert careful == measure(rendering, careful.threshold)
+    assert careful.empty_fraction < full.empty_fraction
+    assert report["threshold"] == careful.threshold
 
 
 def test_photographs_that_vouch_do_not_teach_the_small_gate_either() -> None:

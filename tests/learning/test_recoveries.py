@@ -65,7 +65,7 @@ def healthy_run() -> Callable[..., SimpleNamespace]:
         run.optimizer = optimizer
         learner.probes = SimpleNamespace(logits=lambda: run.looks)
         measured, freeze = Measured(threshold, 0.0, 0.0, 0.0, skipped), mixture.freeze
-        learner.held_out.price = lambda: (measured, measured._asdict())
+        learner.held_out.price = lambda _: (measured, measured._asdict())
 
         def noted(threshold: float, report: dict[str, Any]) -> None:
             run.frozen.append(report["step"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import pytest
@@ -15,6 +16,7 @@ from leco_plugin.learning.schedule import (
     is_unsettled,
     ramp,
     schedule_since,
+    steps_in,
     steps_of_an_extension,
 )
 
@@ -37,6 +39,36 @@ def test_a_gate_that_begins_anew_has_the_schedule_of_the_steps_from_there() -> N
     first, anew = (Progress(learn_steps=began + 600, began=began) for began in (0, 2000))
     assert schedule_since(SCHEDULE, anew) == schedule_since(SCHEDULE, first)
     assert schedule_since(SCHEDULE, anew).learn_steps == 600
+
+
+@pytest.mark.parametrize(
+    ("end", "steps"),
+    [(1999, 200), (2900, 290), (8000, 800), (8001, 800), (10_000_000, 800), (math.inf, 200)],
+)
+def test_a_long_run_learns_for_its_share_up_to_four_times(end: float, steps: int) -> None:
+    assert steps_in(end, ScheduleConfig(learn_steps=200, learn_share=0.1)) == steps
+    assert steps_in(end, ScheduleConfig(learn_steps=200)) == 200
+
+
+@pytest.mark.parametrize("share", [-0.1, 0.51, math.nan])
+def test_a_share_of_a_run_that_is_none_is_refused(share: float) -> None:
+    with pytest.raises(ValueError, match=r"schedule\.learn-share is .*from 0 to 0\.5"):
+        ScheduleConfig(learn_share=share)
+    ScheduleConfig(learn_share=0.5)
+
+
+@pytest.mark.parametrize(
+    ("phase", "extensions", "longer"), [(200, 0, True), (200, 1, False), (150, 0, False)]
+)
+def test_only_a_phase_of_usual_length_grows_with_its_run(
+    phase: int, extensions: int, longer: bool
+) -> None:
+    """One that was shortened keeps to its time, and one that was extended has had its steps."""
+    progress = Progress(learn_steps=phase + 7, phase=phase, configured=200, extensions=extensions)
+    progress.lengthen(200, 300)
+    assert (progress.phase, progress.learn_steps) == ((300, 307) if longer else (phase, phase + 7))
+    progress.lengthen(200, 250)
+    assert progress.phase == (300 if longer else phase), "it never shrinks"
 
 
 @pytest.mark.parametrize("learn_steps", [1, 2, 10])

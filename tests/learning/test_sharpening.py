@@ -228,6 +228,34 @@ def test_it_is_sharpened_at_the_end_of_a_run_that_pays_for_it(
     assert as_learned(file).gate.config == SMALLEST.gate and as_learned(file).threshold == 0.5
 
 
+@pytest.mark.parametrize(
+    ("end", "steps", "goes_on", "careful"),
+    [
+        (200, 5, True, True),
+        (15, 5, True, True),
+        (14, 5, True, False),
+        (200, 0, True, False),
+        (200, 5, False, False),
+    ],
+    ids=["long", "just long enough", "too short", "never sharpened", "a gate alone"],
+)
+def test_a_gate_that_a_small_one_follows_skips_carefully(
+    end: int, steps: int, goes_on: bool, careful: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frozen at step 3, a run of 15 steps is guided for 10.5 until nine tenths are over."""
+    learner, asked = at_the_end(small_mixture(), end, steps=steps), []
+    monkeypatch.setattr(learner.run, "goes_on", goes_on)
+
+    def price(careful: bool) -> None:
+        asked.append(careful)
+        raise StopIteration
+
+    monkeypatch.setattr(learner.held_out, "price", price)
+    with pytest.raises(StopIteration):
+        learner._freeze(3)
+    assert asked == [careful]
+
+
 @pytest.mark.parametrize("least_steps", [0, 1, 10])
 def test_a_tenth_of_a_run_is_sharpened(least_steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
     learner = at_the_end(a_mixture(), 200, least_steps=least_steps)
