@@ -157,8 +157,8 @@ def gain_table(results: Mapping[str, Any]) -> str:
     words = (
         "A query asks a network about one point; *small* ones ask a proposal network or a gate. "
         "*LeCO* is the paper's model: networks, the *experts*, of which the gate chooses one for "
-        "each point: one for all that is there, unless the scene is very large. A *host* is a "
-        "method that an occupancy guides. What is *never frozen* skips nothing; *long steps* take "
+        "each point. This scene has one; larger ones have more. A *host* is a method that an "
+        "occupancy guides. What is *never frozen* skips nothing; *long steps* take "
         "fewer samples of each ray. PSNR, which is better when higher, is a mean over seeds, with "
         "the least and the most; the others are medians. Behind ± stands a 95% interval."
     )

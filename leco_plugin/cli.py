@@ -210,7 +210,8 @@ def swap(
             scaled by 0.1. own: as the method has them, which can cost test views several dB.
         other_scene: Train also where the occupancy is of another scene, as far as its cameras say.
         learn_seconds: Time, about, that learning an occupancy may take; it comes before the
-            method's own steps. By default as many steps as leco-occupancy learns for.
+            method's own steps. By default 200 steps, 2,000 on a GPU, and more where the gate has
+            not settled.
         json: File for the folder of the run, as JSON.
     """
     from nerfstudio.scripts.train import main as train

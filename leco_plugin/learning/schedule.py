@@ -41,8 +41,9 @@ class ScheduleConfig:
     learn_steps: int = 200
     """Steps after which the gate is frozen even if a few of its decisions still change."""
     learn_share: float = 0.0
-    """Share of a run that its gate is learned in where that is more than `learn_steps`, up to four
-    times as many; from 0 to 0.5."""
+    """Of leco-occupancy: share of the run's steps in which the gate is learned, where those are more
+    than `learn_steps`. At most four times `learn_steps`; from 0 to 0.5. The options below then mean
+    these steps by `learn_steps`."""
     settled: float = 0.92
     """Share of probe positions whose decision must be the same in the last two checks; else the
     gate learns on for a quarter of `learn_steps`, at most twice."""
