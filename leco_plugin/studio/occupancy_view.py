@@ -65,8 +65,8 @@ class OccupancyView(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.calibrated = ViewerText("Calibrated threshold", NOT_YET, disabled=True)
-        hint = "Draws with another threshold. The run and what it saves keep the calibrated one."
+        self.used = ViewerText("Threshold of the run", NOT_YET, disabled=True)
+        hint = "Draws with another threshold. The run and what it saves keep their own."
         self.keep_from = ViewerSlider("Keep o(x) from", 0.0, 0.0, 1.0, STEP, hint=hint)
         hint = "Over rgb. Green: the gate keeps something on this ray. Blue: it skips all. "
         hint += "Grey: it skips all, and no photograph shows part of it."
@@ -90,7 +90,7 @@ class OccupancyView(nn.Module):
             return
         untouched = self.chosen() is None
         self._own = own
-        self.calibrated.value = f"{own:.4g}"
+        self.used.value = f"{own:.4g}"
         if untouched:
             self.keep_from.value = round(own, 3)
 

@@ -97,7 +97,7 @@ def test_leco_occupancy_is_drawn_at_the_sliders_threshold(
     origins, directions = torch.tensor([[0.0, 0.0, 0.5]] * 2), torch.eye(3)[:2]
     bundle = bundle_of(origins, directions)
     assert draw(monkeypatch, model, bundle).keys() == model(bundle).keys()
-    assert model.leco_view.calibrated.value == NOT_YET
+    assert model.leco_view.used.value == NOT_YET
     model.mixture.freeze(1e-3, {})
     own = model(bundle)["samples_per_ray"]
     assert torch.equal(draw(monkeypatch, model, bundle)["samples_per_ray"], own)
@@ -139,7 +139,7 @@ def test_no_picture_is_finished_for_a_closed_page(host: Any) -> None:
 def test_a_slider_that_nobody_has_moved_follows_the_run() -> None:
     view = OccupancyView()
     view.follow(0.12345)
-    assert (view.calibrated.value, view.keep_from.value) == ("0.1235", 0.123)
+    assert (view.used.value, view.keep_from.value) == ("0.1235", 0.123)
     assert view.chosen() is None
     view.follow(0.3)
     assert view.keep_from.value == 0.3
@@ -148,7 +148,7 @@ def test_a_slider_that_nobody_has_moved_follows_the_run() -> None:
         assert view.chosen() == chosen
     view.keep_from.value = 0.8
     view.follow(0.2)
-    assert (view.calibrated.value, view.chosen()) == ("0.2", 0.8)
+    assert (view.used.value, view.chosen()) == ("0.2", 0.8)
 
 
 def test_the_overlay_colours_what_is_kept(host: Any, monkeypatch: pytest.MonkeyPatch) -> None:
