@@ -41,8 +41,8 @@ class ScheduleConfig:
     learn_steps: int = 200
     """Steps after which the gate is frozen even if a few of its decisions still change."""
     learn_share: float = 0.0
-    """Of leco-occupancy: share of the run's steps in which the gate is learned, where those are more
-    than `learn_steps`. At most four times `learn_steps`; from 0 to 0.5. The options below then mean
+    """Of leco-occupancy: share of the run's steps in which the gate is learned, where those are
+    more than `learn_steps`; at most four times as many. From 0 to 0.5. The options below then mean
     these steps by `learn_steps`."""
     settled: float = 0.92
     """Share of probe positions whose decision must be the same in the last two checks; else the
