@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import re
+from pathlib import Path
+
 import walk
+
+DOCS = Path(__file__).resolve().parent.parent / "docs"
 
 LOG = """/somewhere/script.py:1: FutureWarning: old
   warnings.warn(
@@ -52,3 +58,16 @@ def test_the_readme_says_what_skipping_costs_and_what_another_run_lost() -> None
     )
     lines["train"].append("8 photographs that taught it nothing lose at most 1.28% of theirs")
     assert " pixels. Of 8 photographs that taught them nothing, the worst" in walk.quote(report)
+
+
+def test_what_pages_say_of_the_walk_is_of_the_stored_one() -> None:
+    stored = json.loads(walk.WALK.read_text())
+    tutorial, large = ((DOCS / f"{name}.md").read_text() for name in ("tutorial", "large-scenes"))
+    for row, name in (("poses", "poses"), ("training", "train"), ("film", "film")):
+        (minutes,) = re.findall(rf"^\| {row}\b[^|]*\| (\d+) minutes", tutorial, re.MULTILINE)
+        assert abs(60.0 * int(minutes) - stored["seconds"][name]) < 60.0, row
+    reached = "PSNR of {psnr:.1f} dB and an SSIM of {ssim:.2f}".format(**stored["eval"])
+    assert reached in " ".join(tutorial.split())
+    assert f"took {stored['seconds']['poses'] / 60.0:.1f} minutes" in large
+    stays = any("and the gate stays" in line for line in stored["lines"]["train"])
+    assert ("which therefore stays" in tutorial) == stays
