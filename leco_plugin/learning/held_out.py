@@ -13,6 +13,7 @@ from torch import Tensor
 
 from leco_plugin.evaluation.metrics import psnr
 from leco_plugin.learning.calibration import (
+    THRESHOLDS,
     CalibrationConfig,
     Measured,
     backdrop_price,
@@ -81,8 +82,9 @@ class HeldOut(PriceSource):
             rendering = dense_rendering(mixture, rays, truth, config.rays_at_once)
             of_cameras = [dense_reference(mixture, of_one) for of_one, _ in cameras]
             measured = calibrate(rendering, config, cameras=of_cameras)
-            if careful:
-                measured = measure(rendering, CAREFUL * measured.threshold)
+            if careful and measured.threshold > 0.0:
+                lowest = THRESHOLDS[-1]  # else the watch had none to lower it to but 0
+                measured = measure(rendering, max(CAREFUL * measured.threshold, lowest))
             of_backdrop = backdrop_price(rendering)
             rendered = torch.cat([reference.rgb for reference in rendering.references])
         rule, region = mixture.rule(), mixture.region

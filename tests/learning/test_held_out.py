@@ -14,7 +14,8 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from small_learner import SMALLEST, NoPixels, small_mixture
 
-from leco_plugin.learning.calibration import CalibrationConfig, measure
+from leco_plugin.learning import held_out as module
+from leco_plugin.learning.calibration import THRESHOLDS, CalibrationConfig, measure
 from leco_plugin.learning.dense import dense_reference, dense_rendering, evaluating
 from leco_plugin.learning.held_out import HeldOut
 from leco_plugin.learning.quality import FIELD, ONE_COLOUR
@@ -143,21 +144,25 @@ def test_a_report_has_the_psnr_of_the_field_and_of_one_colour_on_the_rays_of_cal
     assert (report["step_size"], report["cone_angle"]) == mixture.rule()
 
 
-def test_a_careful_price_is_that_of_a_quarter_of_the_threshold() -> None:
-    """What the report says is what is skipped then."""
+@pytest.mark.parametrize(
+    ("calibrated", "careful"),
+    [(0.4, 0.1), (0.002, THRESHOLDS[-1]), (THRESHOLDS[-1], THRESHOLDS[-1]), (0.0, 0.0)],
+)
+def test_a_careful_price_is_that_of_a_quarter_of_the_threshold(
+    calibrated: float, careful: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the report says is what is skipped then. It is none below those that are tried."""
     torch.manual_seed(0)
     mixture, truth, data = small_mixture(), torch.rand(9, 3), NoPixels()
     rays = mixture.rays(data.survey.origins, data.survey.directions, None)
     data.held_out = lambda *_: (rays, truth)  # type: ignore[method-assign]
-    anything = CalibrationConfig(lost_surface_mass=1.0, image_price_db=99.0)
-    held_out = HeldOut(mixture, data, anything, restarted=False)  # type: ignore[arg-type]
-    (full, _), (careful, report) = held_out.price(), held_out.price(careful=True)
-    assert 0.0 < careful.threshold == 0.25 * full.threshold
+    monkeypatch.setattr(module, "calibrate", lambda given, *_, **__: measure(given, calibrated))
+    config = CalibrationConfig()
+    measured, report = HeldOut(mixture, data, config, False).price(True)  # type: ignore[arg-type]
     with evaluating(mixture), torch.no_grad():
-        rendering = dense_rendering(mixture, rays, truth, anything.rays_at_once)
-        assert careful == measure(rendering, careful.threshold)
-    assert careful.empty_fraction < full.empty_fraction
-    assert report["threshold"] == careful.threshold
+        rendering = dense_rendering(mixture, rays, truth, config.rays_at_once)
+        assert measured == measure(rendering, careful)
+    assert report["threshold"] == careful
 
 
 def test_photographs_that_vouch_do_not_teach_the_small_gate_either() -> None:
