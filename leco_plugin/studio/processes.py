@@ -7,6 +7,7 @@ in each process that it starts, and where a pipeline tells torch the number of a
 from __future__ import annotations
 
 import functools
+import shlex
 import sys
 from dataclasses import dataclass, field
 from types import SimpleNamespace
@@ -177,7 +178,7 @@ def _stop(which: str, how: str, config: Any) -> None:
     """Ends the launcher because a process is gone: TrainingStopped, which says what is left."""
     folder = config.get_checkpoint_dir()
     saved = any(folder.glob("*.ckpt"))
-    left = f"nothing that was saved is lost: go on with --load-dir {folder}"
+    left = f"nothing that was saved is lost: go on with --load-dir {shlex.quote(str(folder))}"
     raise TrainingStopped(
         f"{which} of {config.machine.num_devices} processes here was lost ({how}), and the others "
         f"have stopped; {left if saved else 'no checkpoint was saved yet: begin anew'}"

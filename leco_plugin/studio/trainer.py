@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import signal
 import sys
@@ -214,7 +215,8 @@ class AtomicTrainer(Trainer):
         if saved := self._saved():  # a step in doubt is not saved: it goes on from the one before
             done, end = step_of(saved[-1]) + 1, end_of(self.config, self._start_step)
             steps = f"--max-num-iterations {iterations_until(end, done)}"
-            resume = f"the same command with --load-dir {self.checkpoint_dir} {steps} goes on"
+            folder = shlex.quote(str(self.checkpoint_dir))
+            resume = f"the same command with --load-dir {folder} {steps} goes on"
             typed = {"--load-dir", "--max-num-iterations"}.intersection(options_in(sys.argv))
             resume += f", in place of its own {' and '.join(sorted(typed))}" if typed else ""
             parts += [resume] if done < end else []

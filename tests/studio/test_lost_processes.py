@@ -43,9 +43,11 @@ def raised(line: str) -> ProcessRaisedException:
 def test_a_lost_process_is_named(error: Exception, message: str, tmp_path: Path) -> None:
     with pytest.raises(TrainingStopped, match=f"{message}.*; no checkpoint was saved yet"):
         launching(error)(config=config_of(tmp_path))
-    (tmp_path / "step-000000007.ckpt").touch()
-    with pytest.raises(TrainingStopped, match=f"{message}.*--load-dir {tmp_path}$") as caught:
-        launching(error)(config=config_of(tmp_path))
+    folder = tmp_path / "a run"
+    folder.mkdir()
+    (folder / "step-000000007.ckpt").touch()
+    with pytest.raises(TrainingStopped, match=f"{message}.*--load-dir '{folder}'$") as caught:
+        launching(error)(config=config_of(folder))
     assert "\n" not in str(caught.value)
 
 

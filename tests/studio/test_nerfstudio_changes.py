@@ -90,18 +90,20 @@ def test_ctrl_c_asks_for_the_steps_that_are_left(
 ) -> None:
     trainer = resumed(AtomicTrainer, 90 if from_zero else 60)
     trainer.config.steps_per_save = 0
-    trainer.checkpoint_dir = tmp_path
+    trainer.checkpoint_dir = folder = tmp_path / "a run"
+    folder.mkdir()
     trainer.asked_to_stop = SimpleNamespace(is_set=lambda: True)
-    (tmp_path / "step-000000049.ckpt").touch()
+    (folder / "step-000000049.ckpt").touch()
     monkeypatch.setattr("sys.argv", ["ns-train", "leco-occupancy"])
-    with pytest.raises(TrainingStopped, match=f"iterations {90 if from_zero else 40} goes on$"):
+    goes_on = f"--load-dir '{folder}' --max-num-iterations {90 if from_zero else 40} goes on$"
+    with pytest.raises(TrainingStopped, match=goes_on):
         trainer.stop_if_asked(49)
     again = ["--load-dir", "before", "--max_num_iterations=60"]
     monkeypatch.setattr("sys.argv", ["ns-train", "leco-occupancy", *again])
     own = "goes on, in place of its own --load-dir and --max-num-iterations$"
     with pytest.raises(TrainingStopped, match=own):
         trainer.stop_if_asked(49)
-    (tmp_path / "step-000000089.ckpt").touch()
+    (folder / "step-000000089.ckpt").touch()
     with pytest.raises(TrainingStopped) as stopped:
         trainer.stop_if_asked(89)
     assert "goes on" not in str(stopped.value)
