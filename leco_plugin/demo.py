@@ -167,7 +167,8 @@ def never_frozen(config: TrainerConfig, learn_steps: int) -> TrainerConfig:
     config = copy.deepcopy(config)
     config.method_name = NEVER_FROZEN
     pipeline: Any = config.pipeline
-    for path, value in {**SKIPPING_NOTHING, "schedule.learn_steps": learn_steps}.items():
+    learning = {"schedule.learn_steps": learn_steps, "schedule.learn_share": 0.0}
+    for path, value in {**SKIPPING_NOTHING, **learning}.items():
         pipeline.model = changed(pipeline.model, path, value)
     return config
 

@@ -52,7 +52,7 @@ def test_the_never_frozen_run_skips_nothing_as_in_charts() -> None:
     guided = demo._config(Path("city"), Path("out"), 75.0)
     ours = demo.never_frozen(guided, 123).pipeline.model
     theirs = config_of(NEVER_FROZEN, Path("city"), Path("out")).pipeline.model
-    assert ours.schedule.learn_steps == 123
+    assert (ours.schedule.learn_steps, ours.schedule.learn_share) == (123, 0.0)
     assert guided.pipeline.model.schedule.freeze and not ours.schedule.freeze
     assert replace(ours, schedule=theirs.schedule) == theirs
 
