@@ -105,6 +105,8 @@ class Learner:
                 )
         if not mixture.is_frozen:  # else other steps would take it back into the first phase
             progress.begin(configured, most)
+            if run.start < progress.learn_steps:
+                progress.lengthen(configured, steps_in(run.end, self.config.schedule))
         mixture.routing = self.recoveries.routing()
         if not bool(mixture.region.known):
             found = self.data.survey

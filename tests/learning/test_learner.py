@@ -89,6 +89,14 @@ def test_a_run_of_a_few_steps_learns_for_two_at_least(end: int, learns: int) -> 
     assert progress.learn_steps == learns
 
 
+def test_a_long_run_learns_for_its_share_however_seldom_its_gate_is_checked() -> None:
+    schedule, progress = ScheduleConfig(learn_steps=20, learn_share=0.1), Progress()
+    small_learner(ARun(end=500), progress=progress, schedule=schedule).begin()
+    assert (progress.learn_steps, progress.phase, progress.configured) == (50, 50, 20)
+    small_learner(ARun(end=800, start=50), progress=progress, schedule=schedule).begin()
+    assert progress.learn_steps == 50, "a gate that is never frozen is past learning then"
+
+
 def test_a_resumed_run_of_another_schedule_learns_for_half_of_the_steps_that_are_left() -> None:
     progress, longer = Progress(learn_steps=50, configured=50), ScheduleConfig(learn_steps=500)
     small_learner(ARun(start=100, end=300), progress=progress, schedule=longer).begin()
