@@ -153,7 +153,7 @@ def without_float64() -> None:
         patch.object(on_cpu, "has_float64", lambda device: device.type == "cpu"),
         patch.object(scan, "has_float64", lambda device: device.type == "cpu"),
     ):
-        measured, report = held_out.price()
+        measured, _, report = held_out.price()
         mixture.freeze(measured.threshold, report)
         for values in held_out.excesses(0).values():
             Evidence().with_rays(values, 9.0)

@@ -68,8 +68,9 @@ class HeldOut(PriceSource):
         return self.data.of_vouching(self.mixture, self.config.cameras, self.config.camera_rays)
 
     @torch.no_grad()
-    def price(self, careful: bool = False) -> tuple[Measured, dict[str, Any]]:
-        """The threshold to freeze at, within the bounds, and what a report says of it.
+    def price(self, careful: bool = False) -> tuple[Measured, Measured, dict[str, Any]]:
+        """The threshold to freeze at, the largest one within the bounds, and what a report says of
+        the first.
 
         Args:
             careful: whether to skip less than the bounds allow: what is skipped while the field is
@@ -81,14 +82,14 @@ class HeldOut(PriceSource):
         with evaluating(mixture):
             rendering = dense_rendering(mixture, rays, truth, config.rays_at_once)
             of_cameras = [dense_reference(mixture, of_one) for of_one, _ in cameras]
-            measured = calibrate(rendering, config, cameras=of_cameras)
-            if careful and measured.threshold > 0.0:
+            measured = within = calibrate(rendering, config, cameras=of_cameras)
+            if careful and within.threshold > 0.0:
                 lowest = THRESHOLDS[-1]  # else the watch had none to lower it to but 0
-                measured = measure(rendering, max(CAREFUL * measured.threshold, lowest))
+                measured = measure(rendering, max(CAREFUL * within.threshold, lowest))
             of_backdrop = backdrop_price(rendering)
             rendered = torch.cat([reference.rgb for reference in rendering.references])
         rule, region = mixture.rule(), mixture.region
-        return measured, {
+        return measured, within, {
             "params": sum(p.numel() for p in mixture.gate.parameters()),
             **measured._asdict(),
             BACKDROP_PRICE: round(of_backdrop, 4),

@@ -258,16 +258,18 @@ class Learner:
         seconds = round(progress.learn_seconds, 2)
         careful = self._may_sharpen(after=step)
         found = from_first(lambda: (*self.held_out.price(careful), seconds), mixture.device)
-        measured, report, seconds = found
+        measured, within, report, seconds = found
         report |= {"step": step, "train_seconds": seconds, "recoveries": progress.recoveries}
         mixture.freeze(measured.threshold, report)
         say(
             f"occupancy learned in {progress.learn_seconds:.0f} s: threshold "
             f"{measured.threshold:.4f} {measured.line} ({measured.lost_mass:.2e} of all)"
         )
-        if advice := advice_on(measured, step + 1 - progress.since, progress.recoveries):
+        if careful:
+            note(f"that is less than the {within.threshold:.4f} of its bounds: a small gate follows")
+        if advice := advice_on(within, step + 1 - progress.since, progress.recoveries):
             say(advice)
-        if self.recoveries.fall_back(step, measured):
+        if self.recoveries.fall_back(step, within):
             return
         self._leave_file()
         leave_field(mixture, self.run.folder)

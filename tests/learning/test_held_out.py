@@ -133,7 +133,7 @@ def test_a_report_has_the_psnr_of_the_field_and_of_one_colour_on_the_rays_of_cal
     rays = mixture.rays(data.survey.origins, data.survey.directions, None)
     data.held_out = lambda *_: (rays, truth)  # type: ignore[method-assign]
     config = CalibrationConfig(rays_at_once=4)
-    _, report = HeldOut(mixture, data, config, restarted=False).price()  # type: ignore[arg-type]
+    *_, report = HeldOut(mixture, data, config, restarted=False).price()  # type: ignore[arg-type]
     with evaluating(mixture), torch.no_grad():
         shown = dense_reference(mixture, rays).rgb
     for name, colours in ((FIELD, shown.clamp(0.0, 1.0)), (ONE_COLOUR, truth.mean(dim=0))):
@@ -158,10 +158,12 @@ def test_a_careful_price_is_that_of_a_quarter_of_the_threshold(
     data.held_out = lambda *_: (rays, truth)  # type: ignore[method-assign]
     monkeypatch.setattr(module, "calibrate", lambda given, *_, **__: measure(given, calibrated))
     config = CalibrationConfig()
-    measured, report = HeldOut(mixture, data, config, False).price(True)  # type: ignore[arg-type]
+    held_out = HeldOut(mixture, data, config, restarted=False)  # type: ignore[arg-type]
+    measured, within, report = held_out.price(careful=True)
     with evaluating(mixture), torch.no_grad():
         rendering = dense_rendering(mixture, rays, truth, config.rays_at_once)
         assert measured == measure(rendering, careful)
+        assert within == measure(rendering, calibrated)
     assert report["threshold"] == careful
 
 

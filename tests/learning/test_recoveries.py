@@ -50,6 +50,7 @@ def healthy_run() -> Callable[..., SimpleNamespace]:
         end: float = float("inf"),
         threshold: float = 0.5,
         skipped: float = 0.8,
+        careful: float | None = None,
         **options: Any,
     ) -> SimpleNamespace:
         sound = torch.tensor([[20.0, 0.0, 0.0], [0.0, 20.0, 0.0], [0.0, 0.0, 20.0]]).repeat(33, 1)
@@ -65,7 +66,8 @@ def healthy_run() -> Callable[..., SimpleNamespace]:
         run.optimizer = optimizer
         learner.probes = SimpleNamespace(logits=lambda: run.looks)
         measured, freeze = Measured(threshold, 0.0, 0.0, 0.0, skipped), mixture.freeze
-        learner.held_out.price = lambda _: (measured, measured._asdict())
+        carefully = measured if careful is None else measured._replace(empty_fraction=careful)
+        learner.held_out.price = lambda _: (carefully, measured, measured._asdict())
 
         def noted(threshold: float, report: dict[str, Any]) -> None:
             run.frozen.append(report["step"])
@@ -154,6 +156,16 @@ def test_a_gate_in_the_papers_form_by_which_hardly_anything_is_skipped_is_taught
     assert run.frozen[-1] - run.frozen[0] <= 100
     said = "taught in logit form from now on" in printed()
     assert said == bool(recoveries)
+
+
+def test_a_gate_that_skips_carefully_is_judged_by_what_its_bounds_allow(
+    healthy_run, printed: Any
+) -> None:
+    losses, schedule = GateLossConfig(form="paper"), ScheduleConfig(learn_steps=200)
+    run = healthy_run(schedule, skipped=0.3, careful=0.01, gate_loss=losses)
+    go_until_frozen(run, 1000)
+    assert run.mixture.is_frozen and run.progress.recoveries == 0
+    assert "hardly anything" not in printed()
 
 
 def test_advice_counts_the_steps_since_learning_began(healthy_run, monkeypatch) -> None:
