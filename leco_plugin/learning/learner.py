@@ -290,16 +290,19 @@ class Learner:
 
     def _may_sharpen(self, after: int) -> bool:
         """Whether a small gate follows one that guides from step `after` on: the field has to be
-        guided for long enough by then. A gate that is learned alone is not sharpened."""
+        guided for long enough by then. A gate that is learned alone is not sharpened, nor one of
+        another kind: samplers are made for the kind that was asked for."""
         config, when = self.config.sharpening, SHARPENED_FROM * self.run.end
-        return config.steps > 0 and self.run.goes_on and when - after >= config.least_steps
+        same_kind = self.mixture.gate.config.encoding.kind == config.gate.encoding.kind
+        can = config.steps > 0 and self.run.goes_on and same_kind
+        return can and config.least_steps <= when - after < math.inf
 
     def _is_time_to_sharpen(self, step: int) -> bool:
         """Whether so much of the run is over, and the field was guided for long enough by then,
         since freezing or the last time."""
         last, when = self.progress.sharpened_at, SHARPENED_FROM * self.run.end
         now = step + 1 >= when > last + 1  # once in a run, however few steps are enough
-        if not now or self.config.sharpening.steps == 0 or not self.mixture.is_frozen:
+        if not now or not self.mixture.is_frozen:
             return False
         return self._may_sharpen(after=max(last, self.mixture.report["step"]))
 
@@ -307,8 +310,6 @@ class Learner:
         """Has a small gate skip in place of the learned one where it skips more, and says so."""
         mixture, config, started = self.mixture, self.config.sharpening, seconds_now()
         self.progress.sharpened_at = step
-        if mixture.gate.config.encoding.kind != config.gate.encoding.kind:
-            return  # samplers are made for the kind that was asked for
         losses = self.config.gate_loss
         found = from_first(lambda: self.held_out.sharpened(losses, config), mixture.device)
         if found is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -188,7 +189,7 @@ class Pixels:
         return 0.0
 
 
-def at_the_end(mixture: Mixture, end: int = 31, **options: Any) -> Learner:
+def at_the_end(mixture: Mixture, end: float = 31, **options: Any) -> Learner:
     """A learner before the last step of a run whose gate was frozen at step 3."""
     given = {"steps": 5, "least_steps": 10, "rays": 50, "gate": GATE} | options
     sharpening, run = SharpeningConfig(**given), ARun(end=end)
@@ -236,11 +237,12 @@ def test_it_is_sharpened_at_the_end_of_a_run_that_pays_for_it(
         (14, 5, True, False),
         (200, 0, True, False),
         (200, 5, False, False),
+        (math.inf, 5, True, False),
     ],
-    ids=["long", "just long enough", "too short", "never sharpened", "a gate alone"],
+    ids=["long", "just long enough", "too short", "never sharpened", "a gate alone", "endless"],
 )
 def test_a_gate_that_a_small_one_follows_skips_carefully(
-    end: int, steps: int, goes_on: bool, careful: bool, monkeypatch: pytest.MonkeyPatch
+    end: float, steps: int, goes_on: bool, careful: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Frozen at step 3, a run of 15 steps is guided for 10.5 until nine tenths are over."""
     learner, asked = at_the_end(small_mixture(), end, steps=steps), []
@@ -254,6 +256,12 @@ def test_a_gate_that_a_small_one_follows_skips_carefully(
     with pytest.raises(StopIteration):
         learner._freeze(3)
     assert asked == [careful]
+
+
+def test_a_gate_that_no_small_one_can_follow_is_not_careful() -> None:
+    table = GateConfig(EncodingConfig("hash", levels=2, log2_table=6), 8, 1, 1)
+    assert at_the_end(small_mixture(), 200)._may_sharpen(after=3)
+    assert not at_the_end(small_mixture(), 200, gate=table)._may_sharpen(after=3)
 
 
 @pytest.mark.parametrize("least_steps", [0, 1, 10])
