@@ -39,7 +39,8 @@ class ScheduleConfig:
     """Whether the field starts anew when the gate is frozen, for comparison; else it goes on from
     what it has learned."""
     learn_steps: int = 200
-    """Steps after which the gate is frozen even if a few of its decisions still change."""
+    """Steps after which the gate is frozen even if a few of its decisions still change; of a long
+    run `learn_share` makes them more."""
     learn_share: float = 0.0
     """Of leco-occupancy: share of the run's steps in which the gate is learned, where those are
     more than `learn_steps`; at most four times as many. From 0 to 0.5. The options below then mean
