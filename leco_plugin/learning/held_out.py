@@ -89,7 +89,7 @@ class HeldOut(PriceSource):
             of_backdrop = backdrop_price(rendering)
             rendered = torch.cat([reference.rgb for reference in rendering.references])
         rule, region = mixture.rule(), mixture.region
-        return measured, within, {
+        report = {
             "params": sum(p.numel() for p in mixture.gate.parameters()),
             **measured._asdict(),
             BACKDROP_PRICE: round(of_backdrop, 4),
@@ -104,6 +104,7 @@ class HeldOut(PriceSource):
             "aabb": region.aabb.tolist(),
             **self.data.facts(),
         }
+        return measured, within, report
 
     @torch.no_grad()
     def lower(self, below: float, seed: int) -> Measured:

@@ -266,7 +266,7 @@ class Learner:
             f"{measured.threshold:.4f} {measured.line} ({measured.lost_mass:.2e} of all)"
         )
         if careful:
-            note(f"that is less than the {within.threshold:.4f} of its bounds: a small gate follows")
+            note(f"its bounds allow {within.threshold:.4f}; it is lower until a small gate follows")
         if advice := advice_on(within, step + 1 - progress.since, progress.recoveries):
             say(advice)
         if self.recoveries.fall_back(step, within):
