@@ -37,6 +37,7 @@ from leco_plugin.evaluation.report import (
     read_object,
 )
 from leco_plugin.evaluation.timed_run import RAYS_AT_ONCE, run_training, set_up
+from leco_plugin.learning.schedule import steps_in
 from leco_plugin.models import front_to_back, rendering
 from leco_plugin.models.compute.device import fast_precision
 from leco_plugin.models.gate import Gate
@@ -236,7 +237,8 @@ def profile_method(method: str, options: Options, ceilings: Ceilings) -> dict[st
     learner = "" if method == "leco-occupancy" else "occupancy.learning."
     changes: dict[str, Any] = {}
     if options.learn_steps is not None:
-        changes[f"{learner}schedule.learn_steps"] = options.learn_steps
+        learning = {"learn_steps": options.learn_steps, "learn_share": 0.0}
+        changes |= {f"{learner}schedule.{name}": value for name, value in learning.items()}
     if learner and options.occupancy is not None:
         changes["occupancy.path"] = options.occupancy
     parts = Parts()
@@ -246,7 +248,8 @@ def profile_method(method: str, options: Options, ceilings: Ceilings) -> dict[st
         trainer = set_up(config, Budget(steps=config.max_num_iterations), options.seed)
         name_parts(parts, trainer)
         schedule = config.pipeline.model.schedule if not learner else None
-        earliest = 0 if schedule is None else int(schedule.earliest * schedule.learn_steps)
+        steps = 0 if schedule is None else steps_in(config.max_num_iterations, schedule)
+        earliest = 0 if schedule is None else int(schedule.earliest * steps)
         begins = {"learning": max(1, earliest - options.steps), "guided": options.settle}
         course = Course(trainer, parts, begins, options.steps, ceilings)
         try:

@@ -164,7 +164,7 @@ def train(data: Path, sizes: Sizes, seed: int, options: Options) -> dict[str, An
     config.pipeline.datamanager.data = data
     config.output_dir = options.folder / "sweep"
     model = config.pipeline.model
-    schedule = replace(model.schedule, learn_steps=options.learn_steps)
+    schedule = replace(model.schedule, learn_steps=options.learn_steps, learn_share=0.0)
     config.pipeline.model = replace(model, sizes=sizes, schedule=schedule)
     record, trainer = timed_run(
         config,

@@ -22,7 +22,7 @@ from leco_plugin.studio.trainer import AtomicTrainer
 def trainer_of(scene: Path, folder: Path, load_from: Path | None = None) -> AtomicTrainer:
     config = tiny_config(scene, folder, candidates=32)
     model = config.pipeline.model
-    model.schedule = replace(model.schedule, learn_steps=4)
+    model.schedule = replace(model.schedule, learn_steps=4, learn_share=0.0)
     model.calibration = replace(model.calibration, rays=64, recheck_rays=0)
     model.merging = MergingConfig(1e3, rays=64)  # whatever it costs
     config.load_dir = load_from
