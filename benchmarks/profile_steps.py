@@ -247,9 +247,10 @@ def profile_method(method: str, options: Options, ceilings: Ceilings) -> dict[st
         config = config_of(contender, options.data, Path(folder))
         trainer = set_up(config, Budget(steps=config.max_num_iterations), options.seed)
         name_parts(parts, trainer)
-        schedule = config.pipeline.model.schedule if not learner else None
-        steps = 0 if schedule is None else steps_in(config.max_num_iterations, schedule)
-        earliest = 0 if schedule is None else int(schedule.earliest * steps)
+        earliest = 0
+        if not learner:
+            schedule = config.pipeline.model.schedule
+            earliest = int(schedule.earliest * steps_in(config.max_num_iterations, schedule))
         begins = {"learning": max(1, earliest - options.steps), "guided": options.settle}
         course = Course(trainer, parts, begins, options.steps, ceilings)
         try:

@@ -106,7 +106,7 @@ class Learner:
         if not mixture.is_frozen:  # else other steps would take it back into the first phase
             progress.begin(configured, most)
             if run.start < progress.learn_steps:
-                progress.lengthen(configured, steps_in(run.end, self.config.schedule))
+                progress.lengthen(steps_in(run.end, self.config.schedule))
         mixture.routing = self.recoveries.routing()
         if not bool(mixture.region.known):
             found = self.data.survey
@@ -179,7 +179,7 @@ class Learner:
             return
         schedule, frozen = self.config.schedule, self.mixture.is_frozen
         if not frozen and (step + 1) % schedule.steps_per_check == 0:
-            self.progress.lengthen(schedule.learn_steps, steps_in(self.run.end, schedule))
+            self.progress.lengthen(steps_in(self.run.end, schedule))
         if self.config.homogeneous:
             return
         if frozen:

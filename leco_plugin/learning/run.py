@@ -191,10 +191,10 @@ class Progress:
             self.learn_steps = self.since + self.phase
             self.configured = configured
 
-    def lengthen(self, usual: int, steps: int) -> None:
+    def lengthen(self, steps: int) -> None:
         """Makes the first phase one of so many steps, if it has its usual length and no extension:
         a run of fixed time knows only on the way how many steps it has."""
-        if usual <= self.phase < steps and self.extensions == 0:
+        if self.configured <= self.phase < steps and self.extensions == 0:
             self.learn_steps += steps - self.phase
             self.phase = steps
 

@@ -71,7 +71,7 @@ class CheckedReader(DataParser):
             value = getattr(config, option, None)
             require(value is None or is_right(value), option, value, wanted)
         scene = scene_file.scene_file_of(config, split)
-        _refuse_pointers(config)
+        _refuse_pointers(config, "colmap_path")
         try:
             read = super().get_dataparser_outputs(split=split, **options)
             outputs = checked(read, config, split, scene)
@@ -84,6 +84,7 @@ class CheckedReader(DataParser):
             raise
         # nerfstudio's readers assert, ask and exit
         except (Exception, SystemExit) as error:
+            _refuse_pointers(config, "images_path")
             for path in () if scene is None else scene.pictures():
                 _ = header_of(path) if path.is_file() else None  # one that is none goes first
             if scene is not None and isinstance(self, Nerfstudio):
@@ -130,13 +131,12 @@ def reader_name(config: Any) -> str:
     return names[0] if names else type(config).__name__
 
 
-def _refuse_pointers(config: Any) -> None:
-    """InputError for a file of a COLMAP model, or a picture of it, that Git LFS has not fetched."""
-    folders = [getattr(config, name, None) for name in ("colmap_path", "images_path")]
-    for folder in (Path(config.data) / each for each in folders if each is not None):
-        for path in sorted(folder.glob("*")):
-            if is_pointer(path):
-                raise InputError(f"{path} {FETCH}")
+def _refuse_pointers(config: Any, option: str) -> None:
+    """InputError for a file that Git LFS has not fetched in a folder that a COLMAP reader names."""
+    folder = getattr(config, option, None)
+    for path in () if folder is None else sorted((Path(config.data) / folder).glob("*")):
+        if is_pointer(path):
+            raise InputError(f"{path} {FETCH}")
 
 
 def _check_lists(scene: SceneFile) -> None:
@@ -197,11 +197,8 @@ def _remedy(error: BaseException, config: Any) -> str:
     if isinstance(error, UnidentifiedImageError):
         return photograph_files.SAVE_ANEW
     if isinstance(error, FileNotFoundError | NotADirectoryError):
-        missing, otherwise = (
-            Path(error.filename or data),
-            "put that file there, or remove what names it",
-        )
-        return photograph_files.remedy_for_missing(missing, otherwise)[2:]
+        otherwise = "put that file there, or remove what names it"
+        return photograph_files.remedy_for_missing(Path(error.filename or data), otherwise)[2:]
     file = description_of(config, "train") or data / getattr(config, "colmap_path", "")
     if isinstance(error, KeyError):
         return f"add {one_line(error, 40)} to {file}"

@@ -65,9 +65,9 @@ def test_only_a_phase_of_usual_length_grows_with_its_run(
 ) -> None:
     """One that was shortened keeps to its time, and one that was extended has had its steps."""
     progress = Progress(learn_steps=phase + 7, phase=phase, configured=200, extensions=extensions)
-    progress.lengthen(200, 300)
+    progress.lengthen(300)
     assert (progress.phase, progress.learn_steps) == ((300, 307) if longer else (phase, phase + 7))
-    progress.lengthen(200, 250)
+    progress.lengthen(250)
     assert progress.phase == (300 if longer else phase), "it never shrinks"
 
 
