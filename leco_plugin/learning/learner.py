@@ -302,7 +302,7 @@ class Learner:
         since freezing or the last time."""
         last, when = self.progress.sharpened_at, SHARPENED_FROM * self.run.end
         now = step + 1 >= when > last + 1  # once in a run, however few steps are enough
-        if not now or self.config.sharpening.steps == 0 or not self.mixture.is_frozen:
+        if not now or not self.mixture.is_frozen:
             return False
         return self._may_sharpen(after=max(last, self.mixture.report["step"]))
 

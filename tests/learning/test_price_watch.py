@@ -116,7 +116,7 @@ def test_endless_new_rays_count_until_they_are_forgotten() -> None:
     assert len(asked) > 40 and Evidence(*sums[0]).rays == pytest.approx(5.0 * len(rays), rel=1e-3)
 
 
-REPORT = {"threshold": 0.4, "empty_fraction": 0.7, "params": 5}
+REPORT = {"step": 3, "threshold": 0.4, "empty_fraction": 0.7, "params": 5}
 
 
 def guided(run: ARun, restart: bool = False) -> Learner:
