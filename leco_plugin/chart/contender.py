@@ -190,7 +190,7 @@ class Protocol(Budget):
 
     images: int = 2
     """Whole test images rendered at the end."""
-    curve_points: int = 6
+    curve_points: int = 12
     """Evaluations on test pixels while training, off the clock."""
     at_once: int = 1
     """Runs at a time, which share the threads of the machine."""
