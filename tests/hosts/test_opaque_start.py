@@ -59,6 +59,16 @@ def test_a_host_that_is_opaque_already_begins_as_it_would() -> None:
     assert guide.first_density is None
 
 
+def test_a_field_that_begins_denser_than_is_needed_stays_as_it_is() -> None:
+    host, guide = Host(packed=True), Guide()
+    host.other = Host(packed=True, density=30.0).field
+    begin_opaque(host, guide, LENGTHS)
+    assert 1.0 < host.field.average_init_density < 30.0 == host.other.average_init_density
+    guide.first_density = 40.0  # as a checkpoint has it
+    opaque_start.set_first_density(host, guide)
+    assert host.field.average_init_density == host.other.average_init_density == 40.0
+
+
 def test_a_host_that_draws_a_fixed_number_of_samples_is_left_alone() -> None:
     host, guide = Host(packed=False), Guide()
     begin_opaque(host, guide, LENGTHS)

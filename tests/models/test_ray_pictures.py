@@ -69,6 +69,10 @@ def test_occupancy_is_that_of_what_is_met() -> None:
 
 def test_the_expert_is_the_one_with_the_greatest_weight_and_no_mean_of_numbers() -> None:
     assert column(pictures()["expert"]) == [3.0, 0.0, 0.0, 0.0, 0.0]
+    met, _ = before_the_backdrop(rendering(), INTERVALS, RAYS)
+    heavy = met._replace(weights=met.weights.clone())
+    heavy.weights[0] = 0.6  # beside two of a quarter
+    assert leading_expert(heavy, INTERVALS.ray_indices, EXPERTS)[0].tolist() == [1]
 
 
 def test_no_expert_leads_where_nothing_is_met() -> None:

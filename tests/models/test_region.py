@@ -36,7 +36,10 @@ def rays_of(region: Region, images: torch.Tensor | None = None, cut: bool = Fals
 def test_rays_are_cut_to_the_box_and_to_near_and_far() -> None:
     region = region_of(SLAB)
     assert bool(region.known) and not bool(Region().known)
-    assert float(region.lowest) == -torch.inf  # nothing is known of the ground
+    for lowest in (None, 0.0, 0.4, None):  # of None nothing is known of the ground
+        region.set(SceneBounds("box", torch.zeros(3), 1.0, 0.1, 5.0, SLAB, "", lowest))
+        expected = -torch.inf if lowest is None else lowest
+        assert float(region.lowest) == pytest.approx(expected)
     rays = rays_of(region, torch.arange(3), cut=True)
     torch.testing.assert_close(rays.t_mins[0], torch.tensor(1.0))
     torch.testing.assert_close(rays.t_maxs[0], torch.tensor(3.0))
