@@ -132,6 +132,15 @@ def test_cells_of_an_unbounded_space_are_no_part_of_the_occupancy():
     assert estimator.occupied(positions).equal(before)
 
 
+def test_an_occupancy_without_end_has_no_box_whatever_was_there_before():
+    estimator = LearnedOccupancyEstimator(Balls(), cache_bytes=0)
+    for kind in ("contraction", "box", "contraction"):
+        estimator.occupancy = Balls(kind, half_extent=0.5)
+        own = LearnedOccupancyEstimator(Balls(kind, half_extent=0.5), cache_bytes=0)
+        assert estimator.aabbs.equal(own.aabbs)
+        assert (estimator.bounds() is None) == (own.bounds() is None) == (kind == "contraction")
+
+
 def test_estimators_that_share_an_occupancy_all_follow_it():
     occupancy, other = SLAB.occupancy(), LearnedOccupancyEstimator(moved(), cache_bytes=0)
     sharing = [LearnedOccupancyEstimator(occupancy, cache_bytes=0) for _ in range(2)]

@@ -45,13 +45,13 @@ def test_the_interface_is_that_of_nerfaccs_grid():
 
 def test_samples_are_the_occupied_candidates(bare):
     origins, directions = camera_rays(40)
-    near = torch.full((40,), 0.7)
+    near, far = torch.tensor([0.3, 0.7]).repeat(20), torch.tensor([2.1, 3.0, 1.9, 1.7]).repeat(10)
+    planes = {"near_plane": 0.5, "far_plane": 2.0}  # each is the narrower limit of some rays
     samples = bare.sampling(
-        origins, directions, t_min=near, near_plane=0.5, far_plane=2.5, render_step_size=0.03
+        origins, directions, t_min=near, t_max=far, render_step_size=0.03, **planes
     )
-    expected = slow_march(
-        origins, directions, near, torch.full((40,), 2.5), 0.03, 0.0, bare.occupancy.occupied
-    )
+    ends = near.clamp(min=0.5), far.clamp(max=2.0)
+    expected = slow_march(origins, directions, *ends, 0.03, 0.0, bare.occupancy.occupied)
     assert samples[0].tolist() == [ray for ray, _, _ in expected]
     assert samples[1].tolist() == pytest.approx([start for _, start, _ in expected], abs=1e-5)
 
