@@ -104,6 +104,7 @@ def test_grids_that_never_keep_as_little_are_named() -> None:
 def test_losses_are_compared_at_about_the_volume_of_the_chosen_one() -> None:
     assert VOLUMES[common_volume([SMALL_GATE, COARSE])] == 0.06
     assert VOLUMES[common_volume([SMALL_GATE | {"kept_volume": 0.021}])] == 0.02
+    assert common_volume([SMALL_GATE | {"kept_volume": 0.0}]) == 0
     sizes = {FINE["bytes"]: "2.1 MB", 10**6: "1.0 MB", 999_000: "999.0 kB", 1_234: "1.2 kB"}
     assert {size: kilobytes(FINE | {"bytes": size}) for size in sizes} == sizes
 
@@ -129,7 +130,3 @@ def test_what_skips_nothing_is_not_said_to_suffice() -> None:
     assert title == "At this loss nothing can be skipped"
     assert said.startswith(title) and "--learn-steps" in said
     assert "suffices" in answer([*full, FINE])[0]
-
-
-def test_a_volume_to_compare_at_is_found_where_next_to_nothing_is_kept() -> None:
-    assert common_volume([SMALL_GATE | {"kept_volume": 0.0}]) == 0

@@ -116,9 +116,11 @@ def rays_down(count: int) -> Rays:
     return Rays(origins, directions, torch.zeros(count), torch.full((count,), 2.0), None)
 
 
-def test_without_a_field_what_is_kept_is_worth_its_occupancy() -> None:
-    known = ball()
+@pytest.mark.parametrize("cone_angle", [None, 0.1])
+def test_without_a_field_what_is_kept_is_worth_its_occupancy(cone_angle: float | None) -> None:
+    known, growth = ball(), cone_angle or 0.0
     report = {"near": 0.0, "far": 2.0, "step_size": 0.05}
+    report |= {} if cone_angle is None else {"cone_angle": cone_angle}
     original = Occupancy(known.gate, known.space, known.threshold, report=report).eval()
     seen = Seen(rays_down(1500), torch.rand(1500, 3))  # more than are asked about at once
     found, rendered = gather(None, original, seen)
@@ -127,5 +129,12 @@ def test_without_a_field_what_is_kept_is_worth_its_occupancy() -> None:
     values = original.query(found.positions)
     assert torch.equal(found.kept, values >= original.threshold)
     torch.testing.assert_close(found.worth, values * found.kept)
+    t, middles = 0.0, []
+    while (middle := t + 0.5 * max(0.05, growth * t)) < 2.0:  # steps as the run marched them
+        middles.append(middle)
+        t += max(0.05, growth * t)
+    first = found.positions[found.ray_indices == 0] - seen.rays.origins[0]
+    torch.testing.assert_close(first[:, 2], -torch.tensor(middles), atol=1e-5, rtol=1e-5)
     outside = loss(found, found.kept & (found.positions[:, 2] > CENTRE[2]))
-    assert outside.share == pytest.approx(0.5, abs=0.05)  # the upper half of the ball
+    if cone_angle is None:
+        assert outside.share == pytest.approx(0.5, abs=0.05)  # the upper half of the ball

@@ -40,6 +40,7 @@ from leco_plugin.evaluation.inspection import whole_box
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig, check_sizes
 from leco_plugin.occupancy import Occupancy
+from leco_plugin.space import Space
 
 NOBODY, FILE = Source(None, None), Path("occupancy.safetensors")
 TOO_SMALL = GateConfig(EncodingConfig(octaves=1), 1, 1, 1)
@@ -193,6 +194,15 @@ def test_a_threshold_that_keeps_a_share_keeps_it() -> None:
         assert float((scores >= find_threshold(scores, share)).float().mean()) == pytest.approx(
             share
         )
+
+
+@pytest.mark.parametrize("kind", ["box", "contraction"])
+def test_places_are_spread_evenly_and_decided_by_their_seed(kind: Any) -> None:
+    known = Occupancy(ball().gate, Space(kind, CENTRE, HALF), 0.5)
+    one, same, other = (searching.spread_positions(known, 4000, seed) for seed in (1, 1, 2))
+    assert torch.equal(one, same) and not torch.equal(one, other)
+    counts = [torch.histc(along, 8, -1.0, 1.0) for along in known.space.map(one).T]
+    torch.testing.assert_close(torch.stack(counts), torch.full((3, 8), 500.0), atol=125.0, rtol=0.0)
 
 
 def test_places_anywhere_are_taught_too() -> None:

@@ -318,6 +318,30 @@ def test_what_is_declared_holds_against_the_field_at_the_moment_of_freezing(
         assert part.evidence.rays == references.RAYS > sum(len(one.truth) for one in part.rendered)
 
 
+@pytest.mark.parametrize("lower", [0.2, None])
+def test_the_kept_volume_is_of_the_file_that_was_shrunk_whatever_its_threshold_became(
+    lower: float | None, ball: Path
+) -> None:
+    given = Occupancy.load(ball)
+    original = given if lower is None else given.with_threshold(lower)
+    smaller = original.with_threshold(0.05)
+    of_given, of_original, of_smaller = map(search.kept_of_box, (given, original, smaller))
+    lowered = {"from": given.threshold, "to": original.threshold}
+    lowered["kept_volume"] = of_original / of_given
+    rung = references.Rung("", 1, 2, of_smaller / of_original, 0.0, None, "chosen", 0.0)
+    rung.verified = {"kept_candidates_dropped": 0.0, "lost_surface_mass_bound": 0.0}
+    rung.verified |= dict.fromkeys(("lost_mass", "image_price_db", "empty_fraction"), 0.0)
+    nothing = torch.zeros(0)
+    part = references.Part(Evidence(nothing, nothing, nothing, nothing, nothing, rays=3))
+    known = references.Reference(references.NOW, None, 0.0, 0.0, 0.0, part, part)
+    here = references.Ground(original, part.evidence, [known])
+    said = None if lower is None else lowered
+    report = shrink._report_of(here, smaller, rung, False, said, None)
+    kept = report["kept_volume_of_the_original"]
+    assert kept == pytest.approx(of_smaller / of_given, abs=1e-4) and kept > 1.01
+    assert report["threshold"] == pytest.approx(0.05) and report["calibration_rays"] == 3
+
+
 def test_an_empty_field_is_no_reference(known: tuple[sources.Source, Occupancy]) -> None:
     source, original = known
     assert source.model is not None
