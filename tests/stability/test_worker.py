@@ -288,3 +288,14 @@ def test_errors_of_pictures_are_those_of_the_pixels_that_are_looked_at(tmp_path:
     assert found.detail_psnr == pytest.approx(-10 * math.log10(0.09))
     assert found.lost_mass is None and found.trivial_psnr == pytest.approx(120.0)
     assert shown.shape == (HEIGHT, WIDTH, 3) and set(shown[0, :, 0]) == {204, 153}
+
+
+def test_who_saw_nothing_paints_the_mean_colour_of_all_pictures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pictures, colours = Pictures(tmp_path, 2), ((0.2, 0.5, 0.8), (0.6, 0.5, 0.4))
+    images = [torch.tensor(colour).expand(HEIGHT, WIDTH, 3) for colour in colours]
+    monkeypatch.setattr(pictures, "get_data", lambda number: {"image": images[number]})
+    found, _ = measure(pipeline_of(pictures, scale=1.0), tmp_path, 64)
+    squared = (0.2**2 + 0.0 + 0.2**2) / 3  # (0.4, 0.5, 0.6) is the mean
+    assert found.trivial_psnr == pytest.approx(-10 * math.log10(squared))
