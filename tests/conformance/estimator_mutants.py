@@ -329,6 +329,19 @@ ShadesTheFaint = deaf_to("ShadesTheFaint", alpha_thre=0.0)
 DeafToDensities = deaf_to("DeafToDensities", sigma_fn=None, alpha_fn=None)
 
 
+class BeyondItsBox(Sound):
+    """Goes on for a step in training, nearer to the box than skipping is looked at."""
+
+    def bounds(self) -> Tensor | None:
+        box, wider = super().bounds(), torch.tensor([-STEP] * 3 + [STEP] * 3)
+        return box if box is None or not self.training else box + wider.to(box)
+
+    def occupied(self, positions: Tensor) -> Tensor:
+        box = super().bounds()
+        inside = positions if box is None else positions.clamp(*box.view(2, 3))
+        return super().occupied(inside)
+
+
 MUTANTS: dict[str, tuple[type, ...]] = {
     "signature": (RaysInAnotherOrder, AnotherDefault, NoTorchModule),
     "shapes-types-devices": (DoubleStarts, WritesIntoRays),
@@ -350,7 +363,7 @@ MUTANTS: dict[str, tuple[type, ...]] = {
         Normalises,
         ClippedToTheBox,
     ),
-    "all-kept-equals-dense": (DropsTheFirst, StepsOfOneLength),
+    "all-kept-equals-dense": (DropsTheFirst, StepsOfOneLength, BeyondItsBox),
     "no-gradient-to-the-gate": (GateThaws, GradientsSwitchedOff, CarriesAGraph),
     "zero-samples-well-formed": (StandInSample, FloatWhenEmpty),
     "visibility-pruning": (StopsEarly, ShadesTheFaint, DeafToDensities),

@@ -13,7 +13,12 @@ from typing import Any
 import torch
 from conformance.estimator_mutants import Answers, rank
 from conformance.proposal_mutants import SoundProposal
-from conformance.shading_mutants import ShadesElsewhere, ShadesEverySecond, ShadesItsBoxOnly
+from conformance.shading_mutants import (
+    AsksThereToo,
+    ShadesElsewhere,
+    ShadesEverySecond,
+    ShadesItsBoxOnly,
+)
 from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.data.datamanagers.base_datamanager import (
     DataManagerConfig,
@@ -282,6 +287,7 @@ HOST_MUTANTS: dict[str, dict[str, GuidedModelConfig]] = {
         "ShadesEverySecond": packed(ShadesEverySecond),
         "ShadesItsBoxOnly": packed(ShadesItsBoxOnly, config=replace(PACKED, cone_angle=0.01)),
         "ShadesElsewhere": packed(ShadesElsewhere),
+        "AsksThereToo": packed(AsksThereToo),
         "AsksAsItIs": packed(AsksAsItIs),
         "UniformHost": proposal(sampler="Uniform"),
     },

@@ -57,3 +57,14 @@ class ShadesElsewhere(Shades):
         samples.frustums.starts = samples.frustums.starts + 0.025
         samples.frustums.ends = samples.frustums.ends + 0.025
         return torch.ones(len(samples), dtype=torch.bool)
+
+
+class AsksThereToo(ShadesElsewhere):
+    """Asks there and at each sample, and shades what it should."""
+
+    def chosen(self, samples: RaySamples) -> Tensor:
+        every = torch.ones(len(samples), dtype=torch.bool)
+        behind = samples[every]
+        super().chosen(behind)
+        self.field(behind)
+        return every
