@@ -36,9 +36,12 @@ def pad_to_steady_size(rows: Tensor) -> Tensor:
     return torch.cat([rows, rows.new_zeros(missing, *rows.shape[1:])])
 
 
-def permute_rows(rows: Tensor, order: Tensor, inverse: Tensor) -> Tensor:
-    """Rows [N, D] in another order; `inverse` undoes `order`, both [N] int64."""
-    moved: Tensor = _Permute.apply(rows, order, inverse)
+def permute_rows(
+    rows: Tensor, order: Tensor, inverse: Tensor, filling: Sequence[slice] = ()
+) -> Tensor:
+    """Rows [N, D] in another order; `inverse` undoes `order`, both [N] int64. Rows of `filling`,
+    which `order` leaves out, have no gradient."""
+    moved: Tensor = _Permute.apply(rows, order, inverse, filling)
     return moved
 
 
@@ -50,13 +53,18 @@ def select_rows(rows: Tensor, chosen: Tensor) -> Tensor:
 
 class _Permute(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, rows: Tensor, order: Tensor, inverse: Tensor) -> Tensor:
-        ctx.inverse = inverse
+    def forward(
+        ctx: Any, rows: Tensor, order: Tensor, inverse: Tensor, filling: Sequence[slice]
+    ) -> Tensor:
+        ctx.inverse, ctx.filling = inverse, filling
         return rows.index_select(0, order)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
-        return gradient.index_select(0, ctx.inverse), None, None
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None]:
+        moved = gradient.index_select(0, ctx.inverse)
+        for part in ctx.filling:
+            moved[part] = 0.0
+        return moved, None, None, None
 
 
 class _Select(torch.autograd.Function):
@@ -101,22 +109,7 @@ class Places:
 
     def put_back(self, rows: Tensor) -> Tensor:
         """Placed rows [P, D] as [N, D], in the order of the keys; filling is left out."""
-        back: Tensor = _PutBack.apply(rows, self)
-        return back
-
-
-class _PutBack(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, rows: Tensor, places: Places) -> Tensor:
-        ctx.places = places
-        return rows.index_select(0, places.slots)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        placed = gradient.index_select(0, ctx.places.sources)
-        for filling in ctx.places.filling:
-            placed[filling] = 0.0
-        return placed, None
+        return permute_rows(rows, self.slots, self.sources, self.filling)
 
 
 def dispatch(
