@@ -140,24 +140,11 @@ def prepare_launcher(on_cpu: bool) -> None:
 
 def _launching_once(launcher: Any, launch: Any, on_cpu: bool) -> Any:
     """What stands for `launch` of a module until it has been called."""
-    with_one_line = _with_one_line(launch)
 
     @functools.wraps(launch)
     def launching(*arguments: Any, **options: Any) -> Any:
         launcher.launch, own = launch, launcher._distributed_worker
         launcher._distributed_worker = process if on_cpu else own
-        try:
-            return with_one_line(*arguments, **options)
-        finally:
-            launcher._distributed_worker = own
-
-    launching.of_nerfstudio = launch  # type: ignore[attr-defined]
-    return launching
-
-
-def _with_one_line(launch: Any) -> Any:
-    @functools.wraps(launch)
-    def launching(*arguments: Any, **options: Any) -> Any:
         try:
             return launch(*arguments, **options)
         except ProcessExitedException as error:
@@ -170,7 +157,10 @@ def _with_one_line(launch: Any) -> Any:
             if not any(sign in line for sign in LOST):
                 raise
             _stop("one", "its connection broke", options["config"])
+        finally:
+            launcher._distributed_worker = own
 
+    launching.of_nerfstudio = launch  # type: ignore[attr-defined]
     return launching
 
 
@@ -186,14 +176,9 @@ def _stop(which: str, how: str, config: Any) -> None:
 
 
 def process(local_rank: int, *arguments: Any) -> None:
-    """One of the processes of a run, from its first line to its last, by its number on this machine
-    and what nerfstudio's launcher gives its own function."""
-    train, world_size, here, machine_rank, address, config, timeout, device_type = arguments
-    if device_type != "cpu":
-        from nerfstudio.scripts.train import _distributed_worker
-
-        _distributed_worker(local_rank, *arguments)
-        return
+    """One of the processes of a run on a CPU, by its number on this machine and what nerfstudio's
+    launcher gives its own function."""
+    train, world_size, here, machine_rank, address, config, timeout, _ = arguments
     # each would else take all cores for itself
     torch.set_num_threads(max(1, torch.get_num_threads() // here))
     rank = machine_rank * here + local_rank

@@ -10,7 +10,7 @@ import pytest
 from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
 
 from leco_plugin.scenes.input_error import TrainingStopped
-from leco_plugin.studio.processes import _with_one_line
+from leco_plugin.studio.processes import _launching_once
 
 
 def config_of(checkpoints: Path) -> Any:
@@ -22,7 +22,8 @@ def launching(error: Exception) -> Any:
     def launch(config: Any) -> None:
         raise error
 
-    return _with_one_line(launch)
+    script = SimpleNamespace(launch=launch, _distributed_worker=None)
+    return _launching_once(script, launch, on_cpu=True)
 
 
 def raised(line: str) -> ProcessRaisedException:
