@@ -32,8 +32,8 @@ from leco_plugin.scenes.whole_files import lock, unlock, write_whole, writing_in
 from leco_plugin.studio.checkpoints import (
     allow_checkpoint_globals,
     damage_of,
-    newest_whole,
     step_of,
+    whole_of,
 )
 
 OUTPUT = "--output-dir"
@@ -80,12 +80,13 @@ def _release_all(process: int) -> None:
 
 
 def checkpoint_of(config: Any) -> Path | None:
-    """The checkpoint that training goes on from: of a folder, the newest that is whole. InputError
-    if the folder holds none, or the one that is named is not there or damaged."""
+    """The checkpoint that training goes on from: of a folder, the newest that is whole, with a line
+    about each newer one. InputError if the folder holds none, or the one that is named is not there
+    or damaged."""
     path: Path | None = config.load_checkpoint
     if config.load_dir is not None:
         if config.load_step is None:
-            return newest_whole(config.load_dir)[0]
+            return whole_of(config.load_dir, "going on from {}")
         path = Path(config.load_dir) / f"step-{config.load_step:09d}.ckpt"
     if path is None:
         return None

@@ -29,7 +29,7 @@ from leco_plugin.models.compute.ranks import is_first
 from leco_plugin.names import options_in
 from leco_plugin.samplers.kernels import VARIABLE, kernels_off
 from leco_plugin.scenes.input_error import InputError, TrainingStopped, first_line, one_line
-from leco_plugin.studio.checkpoints import first_not_finite, previous_of, step_of, whole_of
+from leco_plugin.studio.checkpoints import first_not_finite, previous_of, step_of
 from leco_plugin.studio.cooldown import ending_at
 from leco_plugin.studio.run_folder import (
     check_photographs,
@@ -159,9 +159,10 @@ class AtomicTrainer(Trainer):
         asked = self.config.pipeline.model
         checkpoint = checkpoint_of(self.config)
         self.done_before = 0 if checkpoint is None else step_of(checkpoint) + 1
-        self.config = config = with_sizes_of(self.config, checkpoint)
+        config = with_sizes_of(self.config, checkpoint)
+        self.config = replace(config, load_dir=None, load_checkpoint=checkpoint)
         if config.logging.local_writer.enable:
-            self.config = without_tables(config)
+            self.config = without_tables(self.config)
         try:
             with _trackers_in_one_line(config.vis):
                 super().setup(*arguments, **options)
@@ -257,18 +258,8 @@ class AtomicTrainer(Trainer):
 
     @_misfits_in_one_line()
     def _load_checkpoint(self) -> None:
-        """As nerfstudio's, from the newest checkpoint of a folder that is whole. InputError for
-        none, and for one that is of another method or of other options."""
-        config, folder = self.config, self.config.load_dir
-        if folder is None or config.load_step is not None:
-            super()._load_checkpoint()
-            return
-        path = whole_of(folder, "going on from {}")
-        self.config = replace(config, load_dir=None, load_checkpoint=path)
-        try:
-            super()._load_checkpoint()
-        finally:
-            self.config = config
+        """As nerfstudio's. InputError for a checkpoint of another method or of other options."""
+        super()._load_checkpoint()
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:

@@ -6,19 +6,19 @@ import errno
 import os
 import resource
 import signal
-from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
-from nerfstudio.engine.trainer import Trainer
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
 from leco_plugin.samplers.kernels import VARIABLE
 from leco_plugin.scenes.input_error import InputError, TrainingStopped
 from leco_plugin.studio import trainer as atomic_trainer
 from leco_plugin.studio.checkpoints import damage_of
+from leco_plugin.studio.run_folder import checkpoint_of
 from leco_plugin.studio.trainer import (
     AtomicTrainer,
     _say_which_kernels_are_off,
@@ -189,52 +189,24 @@ def test_slow_saves_are_rare(trainer: AtomicTrainer, monkeypatch: pytest.MonkeyP
     assert 0.0 < seconds / now[0] < 0.012
 
 
-class Loads:
-    """In place of nerfstudio's loading: what a trainer was told to load."""
-
-    def __init__(self) -> None:
-        self.paths: list[Any] = []
-
-    def __call__(self, trainer: Trainer) -> None:
-        self.paths.append(trainer.config.load_checkpoint)
-        assert trainer.config.load_dir is None
-
-
-@dataclass
-class Loading:
-    """Of a trainer's config, what loading touches."""
-
-    load_dir: Path | None
-    load_checkpoint: Path | None = None
-    load_step: int | None = None
-    save_only_latest_checkpoint: bool = True
-
-
 @pytest.mark.parametrize("damage", ["cut", "flip", "text"])
 def test_a_damaged_checkpoint_gives_way_to_the_one_before(
-    damage: str,
-    trainer: AtomicTrainer,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    damage: str, trainer: AtomicTrainer, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    loads = Loads()
-    monkeypatch.setattr(Trainer, "_load_checkpoint", lambda self: loads(self))
     trainer.save_checkpoint(10)
     trainer.save_checkpoint(20)
     path = trainer.checkpoint_dir / "step-000000020.ckpt"
-    trainer.config = Loading(trainer.checkpoint_dir)
-    trainer._load_checkpoint()
-    assert loads.paths == [path] and trainer.config == Loading(trainer.checkpoint_dir)
+    config = TrainerConfig(load_dir=trainer.checkpoint_dir)
+    assert checkpoint_of(config) == path
 
     spoil(path, damage)
-    trainer._load_checkpoint()
-    assert loads.paths[1:] == [previous(trainer) / "step-000000010.ckpt"]
+    assert checkpoint_of(config) == previous(trainer) / "step-000000010.ckpt"
     said = "".join(capsys.readouterr().out.split())
     assert "step-000000020.ckptisdamaged" in said and "thenewestthatiswhole" in said
 
     spoil(previous(trainer) / "step-000000010.ckpt", damage)
     with pytest.raises(InputError, match="no checkpoint can be gone on with") as caught:
-        trainer._load_checkpoint()
+        checkpoint_of(config)
     assert "\n" not in str(caught.value)
 
 
@@ -249,16 +221,9 @@ def spoil(path: Path, damage: str) -> None:
         path.write_bytes(content[:500] if damage == "cut" else b"no checkpoint")
 
 
-def test_an_empty_folder_has_no_checkpoint(trainer: AtomicTrainer, tmp_path: Path) -> None:
-    trainer.config = Loading(tmp_path)
-    with pytest.raises(InputError, match="there is no checkpoint in"):
-        trainer._load_checkpoint()
-
-
 MISFIT = "the checkpoint does not fit this method with these options "
 
 
-@pytest.mark.parametrize("by_folder", [True, False])
 @pytest.mark.parametrize(
     ("error", "said"),
     [
@@ -269,23 +234,15 @@ MISFIT = "the checkpoint does not fit this method with these options "
     ],
 )
 def test_a_checkpoint_of_another_method_is_refused_in_a_line(
-    error: Exception,
-    said: str,
-    by_folder: bool,
-    trainer: AtomicTrainer,
-    monkeypatch: pytest.MonkeyPatch,
+    error: Exception, said: str, trainer: AtomicTrainer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def load(_: Trainer) -> None:
         raise error
 
     monkeypatch.setattr(Trainer, "_load_checkpoint", load)
-    trainer.save_checkpoint(10)
-    folder = trainer.checkpoint_dir
-    file = folder / "step-000000010.ckpt"
-    trainer.config = asked = Loading(folder) if by_folder else Loading(None, file)
     with pytest.raises(InputError, match=said) as caught:
         trainer._load_checkpoint()
-    assert "\n" not in str(caught.value) and trainer.config == asked
+    assert "\n" not in str(caught.value)
 
 
 def test_kernels_that_are_off_are_said_before_training(
