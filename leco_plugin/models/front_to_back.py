@@ -9,8 +9,6 @@ twin is `rendering.shade`, which evaluates all of them. On a CPU all of it is on
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import torch
 from torch import Tensor
@@ -42,17 +40,6 @@ FEWEST_AT_ONCE, MOST_LOOKS = 8, 16
 """In torch, samples of a ray between two looks at its transmittance, and looks at the longest."""
 AT_ONCE_IN_C = 2
 """The same samples in C, where a look costs less. Even, as the others: see `asked_first`."""
-
-
-@contextmanager
-def in_float32() -> Iterator[None]:
-    """What C computes in, whatever torch's products have: it is faster than torch in bfloat16.
-
-    Each call has an `autocast` of its own. It restores what it found, so that one which threads
-    share would leave each thread in the precision of another.
-    """
-    with torch.autocast("cpu", enabled=False):
-        yield
 
 
 MANY_RAYS = 2048
@@ -133,7 +120,6 @@ def samples_of(starts: Tensor, counts: Tensor, most: int) -> Tensor:
     return (starts[:, None] + steps)[steps < counts[:, None]]
 
 
-@in_float32()
 def suits_native(scene: Scene, rays: Rays, intervals: Intervals) -> bool:
     """Whether `front_to_back.c` serves."""
     field, gate, _, routing = scene
@@ -145,14 +131,16 @@ def suits_native(scene: Scene, rays: Rays, intervals: Intervals) -> bool:
         and field.suits_native()
         and not (torch.is_grad_enabled() and gate.head.weight.requires_grad)
     )
-    if not (known and gate.suits_native(rays.origins)):
+    if not known:
         return False
     assert isinstance(field.encoding, HashEncoding)
     parts = field.encoding.table, *field.native_parts(), *field.color.layer_parts()
-    return native.suits_networks([*rays[:4], *intervals[1:]], parts)
+    # C is in float32, whatever torch's products have: it is faster than torch in bfloat16
+    with torch.autocast("cpu", enabled=False):
+        known = gate.suits_native(rays.origins)
+        return known and native.suits_networks([*rays[:4], *intervals[1:]], parts)
 
 
-@in_float32()
 @torch.no_grad()
 def shade_natively(scene: Scene, rays: Rays, intervals: Intervals) -> tuple[Shaded, Intervals]:
     """`shade_front_to_back` in C; `evaluation/queries.py` counts what it asks."""
@@ -160,6 +148,9 @@ def shade_natively(scene: Scene, rays: Rays, intervals: Intervals) -> tuple[Shad
     ray_indices, t_starts, t_ends = intervals
     count, outputs = len(rays.origins), scene.gate.head.out_features
     starts, counts = pack_info(ray_indices, count).T.contiguous()
+    with torch.autocast("cpu", enabled=False):
+        of_rays = color.hidden_of_rays(rays.directions, rays.images, rays.origins).contiguous()
+        asked_of = in_c(scene)
     totals = {
         "rgb": rays.origins.new_zeros(count, 3),
         "accumulation": rays.origins.new_zeros(count),
@@ -178,13 +169,11 @@ def shade_natively(scene: Scene, rays: Rays, intervals: Intervals) -> tuple[Shad
     asked = native.call_along_rays(
         "front_to_back",
         starts,
-        in_c(scene),
+        asked_of,
         {
             "origins": rays.origins.contiguous(),
             "directions": rays.directions.contiguous(),
-            "of_rays": color.hidden_of_rays(
-                rays.directions, rays.images, rays.origins
-            ).contiguous(),
+            "of_rays": of_rays,
             "ends": backdrop_ends(rays).contiguous(),
             "starts": starts,
             "counts": counts,
