@@ -100,12 +100,12 @@ TRIES = 100
 """Draws of a pixel that no mask hides: one in three fails where 1% of the pixels are seen."""
 
 
-def look_up(source: Any, which: Tensor, places: Tensor) -> Tensor:
-    """Values [K, ...] of pixels at rows and columns [K, 2] of pictures numbered [K], int64, in
-    images [P, H, W, ...], a list of one or more [H, W, ...], or stored ones."""
+def look_up(source: Any, places: Tensor) -> Tensor:
+    """Values [K, ...] of pixels [K, 3] int64 (picture, row, column) of images [P, H, W, ...], of a
+    list of one or more [H, W, ...], or of stored ones."""
     if isinstance(source, StoredPictures):
-        return source.read(which, places)
-    rows, columns = places.unbind(dim=-1)
+        return source.read(places)
+    which, rows, columns = places.unbind(dim=-1)
     if isinstance(source, Tensor):
         return source[which.to(source.device), rows.to(source.device), columns.to(source.device)]
     values, order = source[0].new_zeros(len(which), *source[0].shape[2:]), which.argsort()
@@ -206,7 +206,7 @@ class HeldOutPixelSampler(PixelSampler):
         """A batch as nerfstudio makes it, also of stored pictures."""
         pictures = image_batch["image"]
         if isinstance(pictures, StoredPictures):
-            return self._sample_stored(pictures, image_batch.get("mask"))
+            return self._sample_stored(image_batch)
         self.numbers = on_cpu(torch.as_tensor(image_batch["image_idx"]))
         return dict(super().sample(image_batch))
 
@@ -234,13 +234,7 @@ class HeldOutPixelSampler(PixelSampler):
             found.append(draw(int(counts[number]), 1, *picture.shape[:2], mask, picture.device))
             found[-1][:, 0] = number
         places = torch.cat(found)[torch.randperm(num_rays_per_batch)].cpu()
-        values = {
-            key: look_up(source, places[:, 0], places[:, 1:])
-            for key, source in batch.items()
-            if key not in ("image_idx", "mask") and source is not None
-        }
-        values |= {"full_image": pictures} if keep_full_image else {}
-        return values | {"indices": torch.cat([numbers[places[:, :1]], places[:, 1:]], dim=-1)}
+        return _pixels_at(batch, places) | ({"full_image": pictures} if keep_full_image else {})
 
     def shown(self, pixels: Tensor, sizes: Tensor, numbers: Tensor | None = None) -> Tensor:
         """Whether a fisheye shows pixels (image, row, column) [N, 3]: bool [N]. Sizes (height,
@@ -293,18 +287,16 @@ class HeldOutPixelSampler(PixelSampler):
             "nothing of the training images: it is in pixels of the images as they are read"
         )
 
-    def _sample_stored(
-        self, pictures: StoredPictures, masks: StoredPictures | None
-    ) -> dict[str, Any]:
+    def _sample_stored(self, batch: dict[str, Any]) -> dict[str, Any]:
         """A batch of pixels that are neither held out nor, as far as there are others, masked."""
+        pictures, masks = batch["image"], batch.get("mask")
         indices = self._drawn_aside(pictures, self.num_rays_per_batch)
         for _ in range(TRIES if masks is not None and not self.config.ignore_mask else 0):
-            assert masks is not None
-            seen = masks.read(indices[:, 0], indices[:, 1:])[:, 0] > 0
+            seen = look_up(masks, indices)[:, 0] > 0
             if bool(seen.all()):
                 break
             indices[~seen] = self._drawn_aside(pictures, int((~seen).sum()))
-        return {"image": pictures.read(indices[:, 0], indices[:, 1:]), "indices": indices}
+        return _pixels_at(batch, indices)
 
     def _drawn_aside(self, pictures: StoredPictures, count: int) -> Tensor:
         """Pixels [count, 3] of stored pictures, none of them held out."""
@@ -359,7 +351,7 @@ class HeldOutPixelSampler(PixelSampler):
         numbers, sizes = torch.as_tensor(images["image_idx"]).cpu(), sizes_of(images["image"])
         seen = self.shown(places, sizes[places[:, 0]], numbers)
         if "mask" in images:
-            masks = look_up(images["mask"], places[:, 0], places[:, 1:])
+            masks = look_up(images["mask"], places)
             seen &= masks.flatten(1).all(dim=1).cpu()
         return seen
 
@@ -379,10 +371,12 @@ class HeldOutPixelSampler(PixelSampler):
 def _pixels_at(images: dict[str, Any], places: Tensor) -> dict[str, Tensor]:
     """Pixels [N, 3] (place in the batch, row, column) as `PixelSampler.sample` returns them."""
     numbers = torch.as_tensor(images["image_idx"]).cpu()
-    return {
-        "image": look_up(images["image"], places[:, 0], places[:, 1:]),
-        "indices": torch.cat([numbers[places[:, :1]], places[:, 1:]], dim=-1),
+    values = {
+        key: look_up(source, places)
+        for key, source in images.items()
+        if key not in ("image_idx", "mask") and source is not None
     }
+    return values | {"indices": torch.cat([numbers[places[:, :1]], places[:, 1:]], dim=-1)}
 
 
 def visible_in_test(manager: Any, number: int, data: dict[str, Any], pixels: Tensor) -> Tensor:

@@ -203,7 +203,7 @@ class KnownDistancePixelSampler(HeldOutPixelSampler):
         known[: len(drawn)] = sparse.distances[drawn].to(known.device)
         for key, source in images.items():
             if key in batch and key not in ("image_idx", "indices"):
-                values = look_up(source, places[:, 0], places[:, 1:])
+                values = look_up(source, places)
                 batch[key][: len(drawn)] = values.to(batch[key].device)
         batch["indices"][: len(drawn)] = pixels.to(batch["indices"].device)
         batch[DISTANCE] = known

@@ -46,16 +46,17 @@ class StoredPictures:
             rows = (polar * heights).long().minimum(heights - 1)
         return torch.stack([which, rows, columns], dim=-1)
 
-    def read(self, which: Tensor, places: Tensor) -> Tensor:
-        """Values [K, C] float32 in [0, 1] of pixels of pictures [K] at places [K, 2] (row, column),
-        int64. InputError if a file is shorter than its picture."""
-        offsets = (places[:, 0] * self.sizes[which, 1] + places[:, 1]) * self.channels
+    def read(self, places: Tensor) -> Tensor:
+        """Values [K, C] float32 in [0, 1] of pixels [K, 3] int64 (picture, row, column). InputError
+        if a file is shorter than its picture."""
+        which, rows, columns = places.unbind(dim=-1)
+        offsets = (rows * self.sizes[which, 1] + columns) * self.channels
         found = np.empty((len(which), self.channels), dtype=np.uint8)
         order = which.argsort(stable=True).tolist()
         numbers, at = which.tolist(), offsets.tolist()
-        for number, rows in groupby(order, numbers.__getitem__):
+        for number, of_file in groupby(order, numbers.__getitem__):
             with self.files[number].open("rb", buffering=0) as file:
-                for row in rows:
+                for row in of_file:
                     file.seek(at[row])
                     if file.readinto(found[row]) != self.channels:
                         raise InputError(f"{self.files[number]} is cut off: delete it and go on")

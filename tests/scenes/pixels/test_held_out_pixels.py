@@ -200,8 +200,7 @@ def test_of_pictures_of_many_sizes_all_are_drawn_alike_and_in_any_order(rays: in
 def test_no_pixels_have_no_values_of_the_right_shape_and_type(kind: str) -> None:
     images = torch.zeros(2, 20, 30, 3, dtype=torch.uint8)
     source = images if kind == "tensor" else list(images)
-    none = torch.zeros(0, dtype=torch.int64)
-    values = look_up(source, none, none.view(0, 2))
+    values = look_up(source, torch.zeros(0, 3, dtype=torch.int64))
     assert values.shape == (0, 3) and values.dtype == torch.uint8
 
 

@@ -58,7 +58,7 @@ def test_every_pixel_is_that_of_the_photograph(tmp_path: Path, channels: int) ->
     dataset = write(tmp_path, channels=channels)
     stored = store_pictures(dataset, tmp_path / "pixels")["image"]
     pixels = stored.draw(500)
-    read = stored.read(pixels[:, 0], pixels[:, 1:])
+    read = stored.read(pixels)
     images = [dataset.get_data(number)["image"] for number in range(3)]
     expected = torch.stack([images[i][r, c] for i, r, c in pixels.tolist()])
     torch.testing.assert_close(read, expected, atol=1e-6, rtol=0)
@@ -149,7 +149,6 @@ def test_a_damaged_file_is_noticed(tmp_path: Path) -> None:
 def test_a_file_cut_off_while_a_run_goes_on_is_one_line(tmp_path: Path) -> None:
     stored = store_pictures(write(tmp_path), tmp_path / "pixels")["image"]
     stored.files[1].write_bytes(stored.files[1].read_bytes()[:-2])
-    last = torch.tensor([[23, 35]])
-    assert stored.read(torch.tensor([0]), torch.tensor([[29, 39]])).shape == (1, 3)
+    assert stored.read(torch.tensor([[0, 29, 39]])).shape == (1, 3)
     with refused("is cut off"):
-        stored.read(torch.tensor([1]), last)
+        stored.read(torch.tensor([[1, 23, 35]]))
