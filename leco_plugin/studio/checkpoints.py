@@ -176,18 +176,13 @@ def checkpoints_of(config: Any) -> Path:
 
 
 def prepare_checkpoints() -> None:
-    """Has checkpoints of this process read safely and whole; every model of this package calls it
-    when it is built, which is before nerfstudio loads one."""
+    """Has checkpoints of this process read safely, and nerfstudio, where its loading of runs is
+    imported, load the newest whole one. Every model of this package calls it when it is built,
+    which is before nerfstudio loads one."""
     allow_checkpoint_globals()
-    evaluate_whole_checkpoints()
-
-
-def evaluate_whole_checkpoints() -> None:
-    """Has nerfstudio, where its loading of runs is imported, load the newest whole checkpoint."""
     utils: Any = sys.modules.get("nerfstudio.utils.eval_utils")
-    if utils is None or hasattr(utils.eval_load_checkpoint, "__wrapped__"):
-        return
-    utils.eval_load_checkpoint = from_whole(utils.eval_load_checkpoint)
+    if utils is not None and not hasattr(utils.eval_load_checkpoint, "__wrapped__"):
+        utils.eval_load_checkpoint = from_whole(utils.eval_load_checkpoint)
 
 
 def from_whole(load: Callable[..., tuple[Path, int]]) -> Callable[..., tuple[Path, int]]:

@@ -14,7 +14,7 @@ from tiny_run import tiny_trainer
 
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.studio.checkpoints import evaluate_whole_checkpoints, from_whole, previous_of
+from leco_plugin.studio.checkpoints import from_whole, prepare_checkpoints, previous_of
 
 
 @pytest.fixture(autouse=True)
@@ -68,9 +68,9 @@ def test_a_step_that_the_config_names_is_loaded_if_it_is_there(folder: Path) -> 
 
 def test_it_is_done_once_and_to_nerfstudio_as_a_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     plain = eval_utils.eval_load_checkpoint
-    evaluate_whole_checkpoints()
+    prepare_checkpoints()
     done: Any = eval_utils.eval_load_checkpoint
-    evaluate_whole_checkpoints()
+    prepare_checkpoints()
     assert eval_utils.eval_load_checkpoint is done and done.__wrapped__ is plain
 
 
