@@ -58,7 +58,7 @@ def train_job(
     from leco_plugin.evaluation.equal_loss import take_occupancy
     from leco_plugin.evaluation.timed_run import timed_run
     from leco_plugin.models.leco import LecoModel
-    from leco_plugin.scenes.photographs import folder_of
+    from leco_plugin.scenes.scene_file import file_in
 
     frozen: dict[str, Any] = {}
 
@@ -80,7 +80,7 @@ def train_job(
         on_progress=on_progress,
         on_frozen=when_frozen,
     )
-    left = take_occupancy(trainer, folder_of(data), folder)
+    left = take_occupancy(trainer, file_in(data).parent, folder)
     facts = None if left is None else left[1]
     if facts is not None:
         facts["at_equal_loss"] = _at_freezing(trainer, frozen, contender)

@@ -45,8 +45,8 @@ class LecoPhotographs(CheckedReader, ReadsNear, Nerfstudio):
         self, split: str = "train", **kwargs: Any
     ) -> DataparserOutputs:
         data = self.config.data
-        meta = load_json(file_in(data))
-        check_images([find_file(folder_of(data) / each["file_path"]) for each in meta["frames"]])
+        meta, folder = load_json(file_in(data)), file_in(data).parent
+        check_images([find_file(folder / each["file_path"]) for each in meta["frames"]])
         up_is_known = self._knows_up(meta)
         if up_is_known and "orientation_override" not in meta:
             # nerfstudio's "up" would take the photographs' top edges for up, and tip the scene
@@ -92,11 +92,6 @@ class LecoPhotographs(CheckedReader, ReadsNear, Nerfstudio):
         return is_free and taken_from_above(poses_in(meta["frames"]))
 
 
-def folder_of(data: Path) -> Path:
-    """The folder that a scene's paths are relative to; `data` is it, or the json file in it."""
-    return file_in(data).parent
-
-
 def taken_from_above(poses: np.ndarray) -> bool:
     """Whether nearly all cameras [C, 4, 4] look down along -z: then +z is already up."""
     return bool(np.mean(poses[:, 2, 2] > 0.7) > 0.75)
@@ -120,8 +115,9 @@ def describe_held_out(data: Path, kind: HeldOut) -> dict[str, Any]:
 def describe_scene(data: Path) -> dict[str, Any]:
     """Name, number of images and digest of a scene, JSON values. InputError if none can be read."""
     images = len(read_scene(data).meta["frames"])
-    digest = hashlib.sha256(file_in(data).read_bytes()).hexdigest()
-    return {"name": folder_of(data).resolve().name, "images": images, "digest": digest[:16]}
+    file = file_in(data)
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    return {"name": file.parent.resolve().name, "images": images, "digest": digest[:16]}
 
 
 def megapixels_of(data: Path) -> float | None:
