@@ -160,10 +160,7 @@ class LearnedOccupancySampler(_ProposalSampler):
     def _in_its_frame(self, positions: Tensor) -> Tensor:
         """Positions [..., 3] of a host in the occupancy's coordinates: [N, 3] float32."""
         flat = positions.reshape(-1, 3).float()  # a host may be in half or double precision
-        if self.frame is None:
-            return flat
-        with torch.autocast(flat.device.type, enabled=False):
-            return moved(flat, self.frame.float())
+        return flat if self.frame is None else moved(flat, self.frame.float())
 
     @torch.no_grad()
     def worth(self, positions: Tensor) -> Tensor:

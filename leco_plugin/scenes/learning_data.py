@@ -108,16 +108,12 @@ class LearningData:
         taught. [0] where they are over a quarter, or batches are not drawn here of all at once."""
         if count not in self._vouching:
             photographs = len(self.manager.train_dataset)
-            can = 0 < SHARE_THAT_VOUCHES * count <= photographs and self._draws_of_all(photographs)
+            can = 0 < SHARE_THAT_VOUCHES * count <= photographs
+            can = can and isinstance(sampler_here(self.manager), HeldOutPixelSampler)
+            can = can and len(_images_of(self.manager)["image"]) == photographs
             numbers = (torch.arange(count) + 0.5) * (photographs / max(count, 1))
             self._vouching[count] = numbers.long() if can else torch.zeros(0, dtype=torch.int64)
         return self._vouching[count]
-
-    def _draws_of_all(self, photographs: int) -> bool:
-        """Whether batches are drawn here, and of all pictures at once."""
-        if not isinstance(sampler_here(self.manager), HeldOutPixelSampler):
-            return False
-        return len(_images_of(self.manager)["image"]) == photographs
 
     def of_vouching(self, mixture: Mixture, count: int, of_each: int) -> list[tuple[Rays, Tensor]]:
         """Rays of each photograph that vouches, and their colours; see `held_out_rays`."""
