@@ -7,9 +7,7 @@ lens is fitted to rays of some pictures of each camera, then a rotation to those
 from __future__ import annotations
 
 import gzip
-import hashlib
 import io
-import os
 import shutil
 import struct
 import zlib
@@ -26,7 +24,13 @@ from scipy.spatial.transform import Rotation
 
 from leco_plugin.log import counted, for_each, resumable
 from leco_plugin.scenes.input_error import InputError, one_line, require_folder
-from leco_plugin.scenes.whole_files import alone_in, remove_parts, write_json, write_whole
+from leco_plugin.scenes.whole_files import (
+    alone_in,
+    digest_of_file,
+    remove_parts,
+    write_json,
+    write_whole,
+)
 
 Array = NDArray[np.float64]
 SCENE, READ = "transforms.json", "leco-rays"
@@ -68,7 +72,7 @@ def make_scene(records: Path, out: Path) -> dict[str, Any]:
         remove_parts(out)
 
         def rays_of(path: Path) -> NDArray[Any]:
-            kept = out / READ / f"{_digest(path)}.npy"
+            kept = out / READ / f"{digest_of_file(path)}.npy"
             if kept.is_file():
                 return np.asarray(np.load(kept))
             rays = np.array([*_read(path, out)], dtype=RAYS)
@@ -91,13 +95,6 @@ def summary(report: dict[str, Any]) -> Iterator[str]:
     worst = f"{error['worst']:.2f} at worst, in {report['worst']}"
     yield f"rays lie {error['median']:.2f} pixels from their pixels (median over pictures), {worst}"
     yield f"rays of one picture begin up to {report['moved']:.3g} from its camera's place"
-
-
-def _digest(path: Path) -> str:
-    """Another one for another file, also where that has taken the name of this one."""
-    known = path.stat()
-    said = f" {known.st_size} {known.st_mtime_ns}".encode()
-    return hashlib.blake2b(os.fsencode(path.resolve()) + said, digest_size=8).hexdigest()
 
 
 def _write_scene(out: Path, pictures: NDArray[Any]) -> dict[str, Any]:

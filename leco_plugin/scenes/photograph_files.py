@@ -7,7 +7,6 @@ Of a mask, each pixel that is not 0 counts as seen.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 import warnings
@@ -24,7 +23,7 @@ from PIL import ExifTags, Image
 
 from leco_plugin.log import bar, by_number, counted, say
 from leco_plugin.scenes.input_error import InputError, one_line
-from leco_plugin.scenes.whole_files import FETCH, LONGEST, is_pointer, write_whole
+from leco_plugin.scenes.whole_files import FETCH, LONGEST, digest_of_file, is_pointer, write_whole
 
 READ_RIGHTLY = ("L", "RGB", "RGBA")
 """Pillow's modes of images that nerfstudio reads as they are."""
@@ -254,10 +253,7 @@ class DerivedImages:
 
     def get(self, source: Path, recipe: str, make: Callable[[], Image.Image]) -> Path:
         """The file with what `make` makes of `source`; `recipe` names it. InputError as `put`."""
-        status = source.stat()
-        known_by = f"{source.resolve()} {status.st_size} {status.st_mtime_ns} {recipe}"
-        digest = hashlib.blake2b(os.fsencode(known_by), digest_size=8).hexdigest()
-        path = self.folder / f"{source.stem[-LONGEST:]}-{digest}.png"
+        path = self.folder / f"{source.stem[-LONGEST:]}-{digest_of_file(source, recipe)}.png"
         if not path.exists():
             self.put(path, make())
         return path

@@ -4,6 +4,7 @@ may be written, before work that takes minutes; and folders that one process at 
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import json
 import os
 import threading
@@ -39,6 +40,14 @@ def write_whole(path: Path, content: bytes | Callable[[BinaryIO], object]) -> No
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def digest_of_file(path: Path, *more: str) -> str:
+    """16 hexadecimal digits of a file's path, size and time of change, and of `more`: others for
+    another file, also where that has taken the name of this one."""
+    known = path.stat()
+    said = " ".join(map(str, (path.resolve(), known.st_size, known.st_mtime_ns, *more)))
+    return hashlib.blake2b(os.fsencode(said), digest_size=8).hexdigest()
 
 
 def is_pointer(path: Path) -> bool:
