@@ -18,8 +18,6 @@ from leco_plugin.evaluation.clock import Clock
 from leco_plugin.evaluation.inspection import ViewBox, in_parts
 from leco_plugin.models.compute.device import free_memory
 from leco_plugin.models.mixture import Mixture
-from leco_plugin.models.rendering import gate_values_and_routes
-from leco_plugin.occupancy import gate_precision
 from leco_plugin.samplers.boxes import cells_of
 
 FEWEST_PROBES, PROBES_ALONG = 8, 2048
@@ -164,16 +162,6 @@ def fits_memory(cells: int) -> bool:
     return free is None or BYTES_A_CELL * cells < free / 2
 
 
-@torch.no_grad()
 def density_of(mixture: Mixture, mapped: Tensor) -> Tensor:
     """Density of a mixture's field at mapped positions [N, 3], per half extent: [N]."""
-
-    def part_of(part: Tensor) -> Tensor:
-        with gate_precision(mixture.device.type, mixture.precision):
-            values, routes = gate_values_and_routes(
-                mixture.gate(part), mixture.routing, mixture.field.experts.remaining_experts()
-            )
-            sigmas: Tensor = mixture.field.density(part, routes, values)[0]
-        return sigmas
-
-    return in_parts(part_of, mapped)
+    return in_parts(lambda part: mixture.answers(part).sigmas, mapped)

@@ -17,7 +17,6 @@ from leco_plugin.models.compute.ranks import share
 from leco_plugin.models.gate import Gate, GateConfig, check_sizes
 from leco_plugin.models.losses import expert_statistics
 from leco_plugin.models.mixture import Mixture
-from leco_plugin.models.rendering import gate_values_and_routes
 from leco_plugin.occupancy import Occupancy, gate_precision
 from leco_plugin.scenes.whole_files import write_whole
 
@@ -54,15 +53,10 @@ class Probes:
         share([logits])
         return logits
 
-    @torch.no_grad()
     def routes_and_densities(self) -> tuple[Tensor, Tensor]:
         """The expert of each position [P] int64, and densities there [P] per half extent."""
-        mixture, places = self.mixture, self.positions
-        remaining = mixture.field.experts.remaining_experts()
-        with gate_precision(mixture.device.type, mixture.precision):
-            logits = mixture.gate(places)
-            values, routes = gate_values_and_routes(logits, mixture.routing, remaining)
-            return routes, mixture.field.density(places, routes, values)[0]
+        answers = self.mixture.answers(self.positions)
+        return answers.routes, answers.sigmas
 
 
 def as_learned(occupancy: Occupancy) -> Occupancy:

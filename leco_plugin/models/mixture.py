@@ -16,12 +16,14 @@ from leco_plugin.models.front_to_back import is_no_slower, shade_front_to_back
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.region import Region, marching_rule
 from leco_plugin.models.rendering import (
+    Answers,
     Intervals,
     Rays,
     Routing,
     Scene,
     Shaded,
     ask,
+    ask_at,
     backdrop_of,
     mapped_middles,
     shade,
@@ -199,6 +201,12 @@ class Mixture(nn.Module):
             sigmas = ask(self.scene(), rays, intervals, freeze_gate=True).sigmas
         backdrops, half_extent = backdrop_of(intervals, rays), self.region.space.half_extent
         return weigh(sigmas, backdrops, intervals, half_extent, len(rays.origins))[0]
+
+    @torch.no_grad()
+    def answers(self, mapped: Tensor) -> Answers:
+        """What gate and field say at mapped positions [M, 3] in [-1, 1]."""
+        with gate_precision(self.device.type, self.precision):
+            return ask_at(self.scene(), mapped, freeze_gate=True)
 
     def scene(self) -> Scene:
         """Whom renderings ask."""

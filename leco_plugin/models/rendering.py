@@ -221,7 +221,11 @@ class Answers(NamedTuple):
 
 def ask(scene: Scene, rays: Rays, intervals: Intervals, freeze_gate: bool) -> Answers:
     """Asks gate and field at the middles of intervals; arguments as for `shade`."""
-    mapped = mapped_middles(scene.space, rays, intervals)
+    return ask_at(scene, mapped_middles(scene.space, rays, intervals), freeze_gate)
+
+
+def ask_at(scene: Scene, mapped: Tensor, freeze_gate: bool) -> Answers:
+    """Asks gate and field at mapped positions [M, 3] in [-1, 1]; `freeze_gate` as for `shade`."""
     with torch.set_grad_enabled(torch.is_grad_enabled() and not freeze_gate):
         logits = scene.gate(mapped)
         remaining = scene.field.experts.remaining_experts()
