@@ -88,12 +88,14 @@ def with_alpha(outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
 
 
 def image_figures(
-    outputs: dict[str, Tensor], truth: Tensor
+    model: Any, outputs: dict[str, Tensor], batch: dict[str, Tensor]
 ) -> tuple[dict[str, float], dict[str, Tensor]]:
     """Figures of one image (see `image_metrics`), and pictures for the log, from `rgb` [H, W, 3],
-    `accumulation` and `depth` [H, W, 1]; truth [H, W, 3] is before the method's own background."""
+    `accumulation` and `depth` [H, W, 1]; the batch's `image` [H, W, 3 or 4] is compared before the
+    background of the `model`, of whose class this is a method."""
     from nerfstudio.utils import colormaps
 
+    truth = model.renderer_rgb.blend_background(batch["image"].to(outputs["rgb"].device))
     predicted = outputs["rgb"].clamp(0.0, 1.0)
     pictures = {
         "img": torch.cat([truth, predicted], dim=1),

@@ -137,15 +137,10 @@ class LecoModel(DrawnInViewer, Model):
     def rays_of(self, bundle: RayBundle) -> Rays:
         """The bundle's rays, cut to the region and to a crop; see `Region.rays`. In the viewer they
         reach the ground from wherever somebody looks."""
-        images = bundle.camera_indices if self.training else None
-        rays = self.mixture.rays(
-            bundle.origins,
-            bundle.directions,
-            None if images is None else images[:, 0],
-            (bundle.nears, bundle.fars),
-        )
+        region = self.mixture.region
+        rays = region.of_bundle(bundle, self.training, self.mixture.steps.min())
         whole = is_viewer_drawing() and bundle.nears is None
-        return self.mixture.region.down_to_the_floor(rays) if whole else rays
+        return region.down_to_the_floor(rays) if whole else rays
 
     def intervals_of(self, rays: Rays) -> Intervals:
         """What is shaded along rays: candidates, or those that the gate lets through."""
@@ -193,6 +188,7 @@ class LecoModel(DrawnInViewer, Model):
         return {"rgb": colors, **shown, **figures.gate_pictures(met, intervals.ray_indices)}
 
     get_rgba_image = staticmethod(figures.with_alpha)
+    get_image_metrics_and_images = figures.image_figures
 
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: Any = None
@@ -237,13 +233,6 @@ class LecoModel(DrawnInViewer, Model):
         truth = self.renderer_rgb.blend_background(batch["image"].to(self.device))
         found = figures.batch_figures(outputs, truth, self.mixture.sizes.gate.scene_experts)
         return found | figures.prices(self.mixture.report)
-
-    def get_image_metrics_and_images(
-        self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
-    ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Figures of one image, and pictures for the log."""
-        truth = self.renderer_rgb.blend_background(batch["image"].to(outputs["rgb"].device))
-        return figures.image_figures(outputs, truth)
 
     def get_extra_state(self) -> dict[str, Any]:
         """How far the run has come travels with a checkpoint, as plain values."""

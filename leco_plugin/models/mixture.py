@@ -137,15 +137,9 @@ class Mixture(nn.Module):
         step, cone = (float(on_cpu(each)[int(coarse)]) for each in (self.steps, self.cones))
         return marching.March(step, cone)
 
-    def rays(
-        self,
-        origins: Tensor,
-        directions: Tensor,
-        images: Tensor | None,
-        crop: tuple[Tensor | None, Tensor | None] = (None, None),
-    ) -> Rays:
+    def rays(self, origins: Tensor, directions: Tensor, images: Tensor | None) -> Rays:
         """Rays cut to the region; see `Region.rays`."""
-        return self.region.rays(origins, directions, images, self.steps.min(), crop)
+        return self.region.rays(origins, directions, images, self.steps.min())
 
     def candidates(
         self, rays: Rays, coarse: bool = False, jitter: Tensor | None = None

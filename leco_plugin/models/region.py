@@ -122,6 +122,13 @@ class Region(nn.Module):
             rays = rays._replace(cut_off=~self.shows_backdrop(rays))
         return within_crop(with_ends_for_all(rays, self.far, length), *crop)
 
+    def of_bundle(self, bundle: Any, training: bool, length: Tensor) -> Rays:
+        """`rays` of a ray bundle of nerfstudio, whose limits are a crop; in training its images are
+        training images."""
+        images, crop = bundle.camera_indices if training else None, (bundle.nears, bundle.fars)
+        images = None if images is None else images[:, 0]
+        return self.rays(bundle.origins, bundle.directions, images, length, crop)
+
     def cut(self, origins: Tensor, directions: Tensor, images: Tensor | None = None) -> Rays:
         """Rays cut to box and range; one that misses them ends before it begins."""
         return cut_rays(origins, directions, self.aabb, self.near, self.far, images)

@@ -181,14 +181,8 @@ class SwitchNerfModel(Model):
 
     def rays_of(self, bundle: RayBundle) -> Rays:
         """The bundle's rays, cut to the region and to a crop; see `Region.rays`."""
-        images = bundle.camera_indices if self.training else None
-        return self.region.rays(
-            bundle.origins,
-            bundle.directions,
-            None if images is None else images[:, 0],
-            self.step.maximum(self.region.far * self.cone),
-            (bundle.nears, bundle.fars),
-        )
+        length = self.step.maximum(self.region.far * self.cone)
+        return self.region.of_bundle(bundle, self.training, length)
 
     def _shade(self, rays: Rays) -> tuple[Intervals, Shaded]:
         """Samples along rays in whichever way, shaded."""
@@ -250,6 +244,7 @@ class SwitchNerfModel(Model):
         return outputs
 
     get_rgba_image = staticmethod(with_alpha)
+    get_image_metrics_and_images = image_figures
 
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: Any = None
@@ -268,10 +263,3 @@ class SwitchNerfModel(Model):
         """PSNR of the batch, its number of samples, and the share of each expert."""
         truth = self.renderer_rgb.blend_background(batch["image"].to(self.device))
         return switch_statistics(outputs["shaded"], truth)
-
-    def get_image_metrics_and_images(
-        self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
-    ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Figures of one image, and pictures for the log."""
-        truth = self.renderer_rgb.blend_background(batch["image"].to(outputs["rgb"].device))
-        return image_figures(outputs, truth)
