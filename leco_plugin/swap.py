@@ -71,9 +71,8 @@ def swapped_config(
         )
     if config.data is not None and not config.data.exists():
         raise InputError(f"there is no scene {config.data} (--data)")
-    made = with_sampler_swapped(config, file, sampler, options, codes, other_scene)
-    made.pipeline.model.occupancy.seconds = learn_seconds  # type: ignore[attr-defined]
-    return made
+    asked = {"sampler": sampler, "options": dict(options), "seconds": learn_seconds}
+    return with_sampler_swapped(config, file, codes, other_scene=other_scene, **asked)
 
 
 def _check_sampler(
@@ -112,16 +111,11 @@ def registered(method: str) -> TrainerConfig:
 
 
 def with_sampler_swapped(
-    config: TrainerConfig,
-    file: Path | None,
-    sampler: str = LEARNED,
-    options: Mapping[str, int | float] = NO_OPTIONS,
-    codes: Codes = "small",
-    other_scene: bool = False,
+    config: TrainerConfig, file: Path | None, codes: Codes = "small", **settings: Any
 ) -> TrainerConfig:
     """The same training with its model guided by an occupancy, learned first where there is no
-    file; the config given is not changed. InputError if the model learns or has an occupancy
-    already, or there is no model."""
+    file, with other settings of `OccupancyConfig`; the config given is not changed. InputError if
+    the model learns or has an occupancy already, or there is no model."""
     from leco_plugin.models.leco_config import LecoModelConfig
 
     pipeline: Any = copy.deepcopy(config.pipeline)
@@ -140,8 +134,7 @@ def with_sampler_swapped(
             f"{config.method_name} has a pipeline without a model that could be guided"
         )
     path = None if file is None else occupancy_file(file.resolve())
-    occupancy = replace(learned_first(), path=path, other_scene=other_scene, sampler=sampler)
-    occupancy.options = dict(options)
+    occupancy = replace(learned_first(), path=path, **settings)
     pipeline.model = GuidedModelConfig(host=host, occupancy=occupancy, codes=codes)
     parser = getattr(getattr(pipeline, "datamanager", None), "dataparser", None)
     if isinstance(parser, DataParserConfig):
