@@ -35,7 +35,7 @@ def _refuse_what_cannot_be_built(case: SamplerCase) -> None:
     try:
         with left_as_before():
             case.build_in(SLAB)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ValueError(
             f"the {case.seam} of sampler {case.name!r} cannot be built: {type(error).__name__}: "
             f"{error} (SamplerSpec says what its builder is called with)"

@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 from torch import nn
 
 from leco_plugin.names import known_names, unknown_name
+from leco_plugin.scenes.input_error import one_line
 
 Kind = TypeVar("Kind")
 
@@ -168,8 +169,9 @@ def _load(builder: Callable[..., nn.Module] | str) -> Callable[..., nn.Module]:
     module, _, attribute = builder.partition(":")
     try:
         made: Callable[..., nn.Module] = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, TypeError) as error:  # the last of names that begin with .
-        raise ValueError(f"{builder} cannot be imported: {error}") from None
+    except (Exception, SystemExit) as error:  # whatever a foreign module raises
+        said = one_line(error) or type(error).__name__
+        raise ValueError(f"{builder} cannot be imported: {said}") from None
     return made
 
 

@@ -99,6 +99,10 @@ def without_jitter(occupancy, num_samples, initial_sampler, frame=None):
     return LearnedOccupancySampler(occupancy, num_samples)
 
 
+def ends(aabb, occupancy):
+    raise SystemExit(3)
+
+
 @pytest.mark.parametrize(
     ("spec", "said"),
     [
@@ -110,8 +114,12 @@ def without_jitter(occupancy, num_samples, initial_sampler, frame=None):
             SamplerSpec("no jitter", proposal=without_jitter, needs_occupancy=True),
             "the proposal of sampler 'crooked' cannot be built: TypeError: .*'single_jitter'",
         ),
+        (
+            SamplerSpec("ends", estimator=ends),
+            "the estimator of sampler 'crooked' cannot be built: SystemExit",
+        ),
     ],
-    ids=["typo", "no jitter"],
+    ids=["typo", "no jitter", "ends"],
 )
 def test_what_cannot_be_built_is_said_once_and_not_rule_by_rule(spec, said, monkeypatch):
     monkeypatch.setitem(registry.OURS, "crooked", spec)

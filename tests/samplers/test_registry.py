@@ -105,10 +105,13 @@ class TakesMore(torch.nn.Module):
         (dict, {"whatever": 2}, None),  # nobody knows what a compiled class takes
         ("nowhere.at_all:build", {}, r"nowhere\.at_all:build cannot be imported: No module named"),
         ("math:build", {}, "math:build cannot be imported: module 'math' has no attribute 'build'"),
+        ("half_written:build", {}, r"^half_written:build cannot be imported: expected .*line 1\)$"),
         ("./mine.py:build", {}, r"^\./mine\.py:build cannot be imported: .*relative import"),
     ],
 )
-def test_builders_of_any_kind_are_asked_what_they_take(builder, options, said, monkeypatch):
+def test_builders_of_any_kind_are_asked_what_they_take(builder, options, said, monkeypatch, tmp_path):
+    (tmp_path / "half_written.py").write_text("def build(aabb, occupancy)\n")
+    monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setitem(registry.OURS, "theirs", SamplerSpec("theirs", estimator=builder))
     expected = contextlib.nullcontext() if said is None else pytest.raises(ValueError, match=said)
     with expected:
