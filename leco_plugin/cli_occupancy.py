@@ -70,6 +70,11 @@ def inspect(
     written = {"--picture": picture, "the page of --picture": page, "--history": history}
     check_apart({**written, "--json": json}, file, data)
     occupancy = Occupancy.load(file)
+    scene = None if picture is None else scene_of(occupancy, file, data)
+    if history is not None:
+        from leco_plugin.evaluation.history_picture import draw_history, read_history
+
+        read_history(occupancy, file.parent)  # a fault of it is said before the picture is drawn
     facts = {**describe(occupancy), "bytes": file.stat().st_size}
     space = facts["space"]
     print(f"{file}: {facts['params']} parameters in {facts['bytes'] / 1000:.1f} kB")
@@ -79,17 +84,14 @@ def inspect(
     print(f"kept share of its box: {facts['kept_share_of_box']:.2%}")
     print(f"share of its box that photographs show: {facts['seen_share_of_box']:.2%}")
     report = facts["report"]
-    for line in [*price_in_words(report), views_in_words(report), *doubts(facts)]:
-        print(line)
+    print(*price_in_words(report), views_in_words(report), *doubts(facts), sep="\n")
     print("its report, whose keys docs/file-format.md explains:")
     for name, value in report.items():
         if isinstance(value, (int, float, str)) and name not in ("params", "threshold"):
             print(f"  {name}: {_said(value)}")
     if picture is not None:
-        _draw(occupancy, picture, scene_of(occupancy, file, data), dark)
+        _draw(occupancy, picture, scene, dark)
     if history is not None:
-        from leco_plugin.evaluation.history_picture import draw_history
-
         print(f"drew {draw_history(occupancy, file.parent, history)}")
     write_report(json, facts)
 

@@ -50,7 +50,7 @@ def draw_history(occupancy: Occupancy, folder: Path, path: Path) -> Path:
         InputError: the run has no history, or one of another gate.
         OSError, ValueError: the picture cannot be written there, or is of no known kind.
     """
-    film = _Film(occupancy, _read(occupancy, folder))
+    film = _Film(occupancy, read_history(occupancy, folder))
     count, frames = len(film.history), []
     if path.suffix.lower() != ".gif":
         return save_whole(film.still(spread_evenly(count, STILL)), path, dpi=DPI)
@@ -85,7 +85,8 @@ def write_film(
     write_whole(path, lambda file: few[0].save(file, "GIF", duration=durations, **options))
 
 
-def _read(occupancy: Occupancy, folder: Path) -> GateHistory:
+def read_history(occupancy: Occupancy, folder: Path) -> GateHistory:
+    """The history in the folder of a run. InputError for none, or one of another gate."""
     file = folder / FILE_NAME
     try:
         return GateHistory.load(file, as_learned(occupancy).gate)

@@ -133,5 +133,8 @@ def test_a_run_without_a_history_is_told_how_to_get_one(
 ) -> None:
     file = tmp_path / "occupancy.safetensors"
     ball().save(file)
-    assert main(["inspect", str(file), "--history", str(tmp_path / "a.gif")]) == 2
-    assert "steps-per-record" in capsys.readouterr().err.splitlines()[-1]
+    places = ["--picture", str(tmp_path / "a.png"), "--history", str(tmp_path / "a.gif")]
+    assert main(["inspect", str(file), *places]) == 2
+    printed = capsys.readouterr()
+    assert "steps-per-record" in printed.err.splitlines()[-1]
+    assert printed.out == "" and [*tmp_path.iterdir()] == [file]  # before anything is drawn
