@@ -277,7 +277,7 @@ class Learner:
             self._merge()
         say(views_in_words(report))
         doubts = doubts_of_field(report.get(FIELD, math.inf), report.get(ONE_COLOUR, math.inf))
-        say_all(doubts or doubts_of_occupancy(kept_of_seen(mixture)))
+        say_all(doubts or doubts_of_occupancy(kept_of_seen(mixture, within.threshold)))
         self.data.prepare_batch(1.0, distances=False)  # from now on all photographs train
         progress.watch = self.watch.state = WatchState()
         progress.suspected_since = -1  # of the gate as it is now

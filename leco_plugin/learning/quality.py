@@ -36,9 +36,9 @@ def psnr_of_one_colour(truth: Tensor) -> float:
 
 
 @torch.no_grad()
-def kept_of_seen(mixture: Mixture) -> float:
-    """Share of the space that training rays cross which a frozen mixture keeps; 0 where they cross
-    none."""
+def kept_of_seen(mixture: Mixture, threshold: float | None = None) -> float:
+    """Share of the space that training rays cross which a frozen mixture keeps, at another
+    threshold if one is given; 0 where they cross none."""
     generator = torch.Generator().manual_seed(0)
     mapped = torch.rand(PLACES, 3, generator=generator).to(mixture.device) * 2.0 - 1.0
     if mixture.region.space.kind == "contraction":
@@ -46,7 +46,7 @@ def kept_of_seen(mixture: Mixture) -> float:
     mapped = mapped[mixture.region.seen(mapped)]
     if len(mapped) == 0:
         return 0.0
-    kept = mixture.occupancies(mapped) >= mixture.threshold
+    kept = mixture.occupancies(mapped) >= (mixture.threshold if threshold is None else threshold)
     return float(in_float64(kept).mean())
 
 

@@ -66,7 +66,9 @@ def healthy_run() -> Callable[..., SimpleNamespace]:
         run.optimizer = optimizer
         learner.probes = SimpleNamespace(logits=lambda: run.looks)
         measured, freeze = Measured(threshold, 0.0, 0.0, 0.0, skipped), mixture.freeze
-        carefully = measured if careful is None else measured._replace(empty_fraction=careful)
+        carefully = measured
+        if careful is not None:
+            carefully = measured._replace(threshold=threshold / 4, empty_fraction=careful)
         learner.held_out.price = lambda _: (carefully, measured, measured._asdict())
 
         def noted(threshold: float, report: dict[str, Any]) -> None:
@@ -163,9 +165,11 @@ def test_a_gate_that_skips_carefully_is_judged_by_what_its_bounds_allow(
 ) -> None:
     losses, schedule = GateLossConfig(form="paper"), ScheduleConfig(learn_steps=200)
     run = healthy_run(schedule, skipped=0.3, careful=0.01, gate_loss=losses)
+    run.mixture.occupancies = lambda mapped: torch.full_like(mapped[:, 0], 0.3)
     go_until_frozen(run, 1000)
     assert run.mixture.is_frozen and run.progress.recoveries == 0
-    assert "hardly anything" not in printed()
+    said = printed()
+    assert "hardly anything" not in said and "of little use" not in said
 
 
 def test_advice_counts_the_steps_since_learning_began(healthy_run, monkeypatch) -> None:
