@@ -70,6 +70,9 @@ class CheckedReader(DataParser):
         for option, (is_right, wanted) in OPTIONS.items():
             value = getattr(config, option, None)
             require(value is None or is_right(value), option, value, wanted)
+        if isinstance(factor := getattr(config, "downscale_factor", None), float):
+            # as `ns-render dataset` gives it; nerfstudio would look for images_2.0
+            config.downscale_factor = int(factor) if factor.is_integer() else factor
         scene = scene_file.scene_file_of(config, split)
         _refuse_pointers(config, "colmap_path")
         try:
