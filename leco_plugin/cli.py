@@ -27,7 +27,7 @@ from leco_plugin.cli_experiments import capacity, chart, check, stability
 from leco_plugin.cli_occupancy import export, inspect, shrink
 from leco_plugin.names import is_like, options_in, unknown_name
 from leco_plugin.scenes.input_error import one_line
-from leco_plugin.scenes.whole_files import check_place, check_report, write_report
+from leco_plugin.scenes.whole_files import check_report, write_report
 
 BAD_INPUT, FAILURE, STOPPED, UNREAD = 2, 1, 130, 141
 """Statuses; the last two are those of a shell after SIGINT and SIGPIPE."""
@@ -71,7 +71,7 @@ def city(
         format: Of the scene: nerfstudio's, or Mega-NeRF's, for the data parser mega-nerf.
         json: File for what was written, as JSON.
     """
-    check_place("--json", json)
+    check_report(json, out)
     from leco_plugin.scenes.city.city import City, CityConfig
     from leco_plugin.scenes.city.folder import CaptureConfig, count_pictures, write_city
 
@@ -251,8 +251,8 @@ def demo(
     began = time.monotonic()
     from leco_plugin.demo import run_demo, summary
 
-    check_place("--json", json)
     out = out or Path("runs/demo-quick" if quick else "runs/demo")
+    check_report(json, out)
     report = run_demo(out, seconds, quick, began)
     print("\n".join(summary(report)))
     print(f"see report.json, chart.png and picture.png in {out}")

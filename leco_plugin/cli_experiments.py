@@ -58,7 +58,7 @@ def chart(
             says; stretch a whole flight line or arc, whose neighbours are not trained on either.
         json: Another file for the results.
     """
-    check_report(json, data)
+    check_report(json, data, out)
     from leco_plugin.chart.command import make_charts, refuse_failures
 
     times = {"seconds": seconds, "steps": steps, "learn_seconds": learn_seconds}
@@ -104,7 +104,7 @@ def stability(
     from leco_plugin.stability.suite import make_table
     from leco_plugin.stability.table import blind, headline
 
-    check_place("--json", json)
+    check_report(json, out)
     results = make_table(out, cases, samplers, seeds, seeds_beside, quick, minutes)
     print(headline(results))
     print(f"see stability.png, table.md, stability.json and failures in {out}")
@@ -137,7 +137,7 @@ def capacity(
     """
     from leco_plugin.capacity.measuring import capacity as measure
 
-    check_report(json, data)
+    check_report(json, data, out)
     results = measure(data, out, grids, lost_surface_mass, learn_steps)
     print(results["verdict"])
     print(f"see capacity.png and results.json in {out}")

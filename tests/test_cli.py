@@ -311,6 +311,12 @@ def test_a_place_that_cannot_be_written_to_is_named_before_anything_is_read_or_w
         ["points", "{folder}", "--json", "{scene}"],
         ["capacity", "--data", "{folder}", "--out", "x", "--json", "{scene}"],
         ["chart", "--data", "{folder}", "--out", "x", "--seconds", "9", "--json", "{scene}"],
+        ["chart", "--data", "{folder}", "--out", "x", "--seconds", "9", "--json", "x"],
+        ["capacity", "--data", "{folder}", "--out", "x", "--json", "x"],
+        ["capacity", "--data", "{folder}", "--out", "x", "--json", "x/settings.json"],
+        ["stability", "--out", "x", "--cases", "flat", "--json", "x"],
+        ["demo", "--seconds", "1", "--out", "x", "--json", "x"],
+        ["city", "--out", "x", "--json", "x"],
     ],
 )
 def test_no_command_writes_over_what_it_reads_or_over_what_it_has_just_written(

@@ -119,7 +119,8 @@ def check_place(option: str, path: Path | None) -> None:
 def check_apart(written: Mapping[str, Path | None], *read: Path | None) -> None:
     """InputError if a file to write, by its option, is one that a command reads or writes twice."""
     known = [path for path in read if path is not None]
-    taken = {path.resolve() for each in known for path in (each, each / "transforms.json")}
+    inside = "transforms.json", "settings.json"  # of a scene, and of a folder of runs
+    taken = {path.resolve() for each in known for path in (each, *map(each.joinpath, inside))}
     for option, path in written.items():
         if path is None:
             continue
