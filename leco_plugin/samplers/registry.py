@@ -169,7 +169,7 @@ def _load(builder: Callable[..., nn.Module] | str) -> Callable[..., nn.Module]:
     module, _, attribute = builder.partition(":")
     try:
         made: Callable[..., nn.Module] = getattr(importlib.import_module(module), attribute)
-    except (Exception, SystemExit) as error:  # whatever a foreign module raises
+    except (Exception, SystemExit) as error:  # noqa: BLE001 (whatever a foreign module raises)
         said = one_line(error) or type(error).__name__
         raise ValueError(f"{builder} cannot be imported: {said}") from None
     return made

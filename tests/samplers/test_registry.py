@@ -109,7 +109,9 @@ class TakesMore(torch.nn.Module):
         ("./mine.py:build", {}, r"^\./mine\.py:build cannot be imported: .*relative import"),
     ],
 )
-def test_builders_of_any_kind_are_asked_what_they_take(builder, options, said, monkeypatch, tmp_path):
+def test_builders_of_any_kind_are_asked_what_they_take(
+    builder, options, said, monkeypatch, tmp_path
+):
     (tmp_path / "half_written.py").write_text("def build(aabb, occupancy)\n")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setitem(registry.OURS, "theirs", SamplerSpec("theirs", estimator=builder))
