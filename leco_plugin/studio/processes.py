@@ -95,7 +95,7 @@ class DataParallelTrainerConfig(TrainerConfig):
     def save_config(self) -> None:
         """Takes the run's folder; one that another run has, or has left, gives way to a new one."""
         wanted, reasons = self.timestamp, []
-        load_from = self.load_checkpoint or self.load_dir
+        load_from = self.load_dir or self.load_checkpoint
         while reason := claim(self.get_base_dir(), self.get_checkpoint_dir(), load_from):
             reasons.append(reason)
             self.timestamp = f"{wanted}-{len(reasons) + 1}"

@@ -204,7 +204,7 @@ class TrainerRun:
         self.start = int(trainer._start_step)
         self.folder = Path(trainer.base_dir) if is_first() else None
         config = trainer.config
-        resumed = config.load_checkpoint or config.load_dir
+        resumed = config.load_dir or config.load_checkpoint  # of both, nerfstudio's choice
         self.resumed_from = None if resumed is None else Path(resumed)
 
     @property

@@ -7,6 +7,7 @@ import functools
 import os
 import signal
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,7 +17,7 @@ from leco_plugin.host_configs import leco_ngp
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.scenes import whole_files
 from leco_plugin.scenes.input_error import InputError
-from leco_plugin.studio.run_folder import claim, release
+from leco_plugin.studio.run_folder import TrainerRun, claim, release
 
 HOLD = """
 import sys
@@ -150,6 +151,20 @@ def test_a_config_goes_to_a_folder_of_its_own_and_says_so(tmp_path: Path, printe
     assert "this run goes to" in printed()
     for made in (first, second):
         release(made.get_base_dir())
+
+
+def test_of_a_folder_and_a_checkpoint_the_folder_is_gone_on_with(tmp_path: Path) -> None:
+    """As nerfstudio has it: the files of the other run are of another gate."""
+    made = copy.deepcopy(leco_occupancy.config)
+    made.output_dir, made.experiment_name, made.timestamp = tmp_path, "tiny", "run"
+    made.load_dir, made.load_checkpoint = made.get_checkpoint_dir(), tmp_path / "other.ckpt"
+    made.load_dir.mkdir(parents=True)
+    (made.load_dir / "step-000000003.ckpt").touch()
+    made.save_config()
+    assert made.timestamp == "run"
+    trainer = SimpleNamespace(config=made, base_dir=made.get_base_dir(), _start_step=4)
+    assert TrainerRun(trainer).resumed_from == made.load_dir
+    release(made.get_base_dir())
 
 
 @pytest.mark.parametrize(
