@@ -306,6 +306,8 @@ def test_a_place_that_cannot_be_written_to_is_named_before_anything_is_read_or_w
         ["export", "{file}", "--format", "ply", "--out", "x.ply", "--json", "x.ply"],
         ["shrink", "{file}", "--data", "{folder}", "--out", "x", "--json", "{file}"],
         ["shrink", "{file}", "--data", "{scene}", "--out", "x", "--json", "{scene}"],
+        ["shrink", "{file}", "--data", "{folder}", "--out", "{points}"],
+        ["inspect", "{file}", "--data", "{scene}", "--picture", "{photograph}"],
         ["swap", "nerfacto", "--occupancy", "{file}", "--json", "{file}"],
         ["swap", "nerfacto", "--occupancy", "{folder}", "--json", "{file}"],
         ["points", "{folder}", "--json", "{scene}"],
@@ -326,6 +328,11 @@ def test_no_command_writes_over_what_it_reads_or_over_what_it_has_just_written(
     file.parent.mkdir()
     ball().save(file)
     places = {"file": file, "folder": here, "scene": here / "transforms.json"}
+    places |= {name: here / f"{name}.png" for name in ("photograph", "points")}
+    frames = [{"file_path": "photograph.png"}]
+    places["scene"].write_text(json.dumps({"frames": frames, "ply_file_path": "points.png"}))
+    for name in ("photograph", "points"):
+        places[name].write_text(name)
     before, arguments = file.read_bytes(), [part.format(**places) for part in command]
     assert f"leco: {command[-2]} {arguments[-1]} is a file that" in refused(*arguments)
     assert file.read_bytes() == before and not (here / "x.ply").exists()

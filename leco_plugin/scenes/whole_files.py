@@ -121,6 +121,8 @@ def check_apart(written: Mapping[str, Path | None], *read: Path | None) -> None:
     known = [path for path in read if path is not None]
     inside = "transforms.json", "settings.json"  # of a scene, and of a folder of runs
     taken = {path.resolve() for each in known for path in (each, *map(each.joinpath, inside))}
+    if any(path is not None and path.is_file() for path in written.values()):
+        taken |= {named for path in taken for named in _named_in(path)}
     for option, path in written.items():
         if path is None:
             continue
@@ -130,6 +132,20 @@ def check_apart(written: Mapping[str, Path | None], *read: Path | None) -> None:
             )
             raise InputError(f"{fault}: give another name")
         taken.add(path.resolve())
+
+
+def _named_in(path: Path) -> set[Path]:
+    """Photographs, masks and points that a transforms.json names; of any other file none."""
+    named: set[Path] = set()
+
+    def note(part: dict[str, Any]) -> None:
+        names = [value for key, value in part.items() if key.endswith("path")]
+        named.update((path.parent / each).resolve() for each in names if isinstance(each, str))
+
+    if path.suffix == ".json":
+        with suppress(OSError, ValueError):  # a damaged one is said when it is read
+            json.loads(path.read_bytes(), object_hook=note)
+    return named
 
 
 def check_report(path: Path | None, *read: Path | None) -> None:
