@@ -93,7 +93,7 @@ class Verdict:
 
     rule: Rule
     seam: str
-    error: Exception | None
+    error: Exception | SystemExit | None
     """What the check raised; None when the rule holds."""
 
     @property
@@ -131,7 +131,7 @@ class Verdict:
         }
 
 
-def _place(error: Exception) -> str:
+def _place(error: BaseException) -> str:
     """Where in the checked code an error came up; empty if it came up elsewhere."""
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         path = Path(frame.filename)
@@ -156,7 +156,7 @@ def apply(rule: Rule, case: Case) -> Verdict:
     with left_as_before():
         try:
             rule.checks[case.seam](case)
-        except Exception as caught:  # noqa: BLE001 (whatever a foreign sampler raises)
+        except (Exception, SystemExit) as caught:  # noqa: BLE001 (whatever a foreign one raises)
             case.forget()
             error = caught
     return Verdict(rule, case.seam, error)

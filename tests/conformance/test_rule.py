@@ -43,11 +43,16 @@ def raises(case):
     raise KeyError("t_min")
 
 
+def ends(case):
+    raise SystemExit("bye")
+
+
 @pytest.mark.parametrize(
     ("check", "problem"),
     [
         (fails, "two of three are wrong"),
         (raises, f"KeyError: 't_min' (test_rule.py, line {raises.__code__.co_firstlineno + 1})"),
+        (ends, f"SystemExit: bye (test_rule.py, line {ends.__code__.co_firstlineno + 1})"),
     ],
 )
 def test_what_is_found_or_raised_is_told_in_one_line(check, problem):
