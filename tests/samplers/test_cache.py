@@ -74,7 +74,7 @@ def test_its_tables_move_with_a_module_and_are_sent_to_nobody(cache):
     assert not list(host.buffers()) and not host.state_dict()
     host.to("meta")
     assert {table.device.type for table in host["cache"].tables()} == {"meta"}
-    assert host["cache"].scale.is_meta and not cache.scale.is_meta
+    assert host["cache"].frame.is_meta and not cache.frame.is_meta
 
 
 def test_few_positions_are_left_to_the_gate(cache, balls):

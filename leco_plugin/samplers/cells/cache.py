@@ -103,66 +103,36 @@ class CellCache(nn.Module):
         report: what building found.
     """
 
-    coarse: Tensor
-    bricks: Tensor
-    first_plane: Tensor
-    planes: Tensor
-    clearance: Tensor
-    scale: Tensor
-    shift: Tensor
-    center: Tensor
-    half_extent: Tensor
-
     def __init__(self, tables: Tables, space: Space, report: CacheReport) -> None:
         super().__init__()
-        self.report = report
-        self.resolution = report.resolution
+        self.report, self.resolution = report, report.resolution
         self.contracted = space.kind == "contraction"
+        center, half_extent = (x.detach().cpu().view(-1) for x in (space.center, space.half_extent))
         scale = torch.full((1,), report.resolution / 2.0)
         shift = torch.full((3,), report.resolution / 2.0 + 1.0)
         if not self.contracted:
             # An affine mapping folds into the scaling to cells.
-            scale = scale / space.half_extent.detach().cpu()
-            shift = shift - space.center.detach().cpu() * scale
-        center, half_extent = space.center.detach().clone(), space.half_extent.detach().clone()
+            scale = scale / half_extent
+            shift = shift - center * scale
         uniform = torch.tensor([[FINE_OCCUPIED], [FINE_EMPTY]], dtype=torch.uint8)
         uniform = uniform.to(tables.fine.device).expand(UNIFORM, BRICK**3)
-        derived = {
-            "coarse": tables.coarse,
-            "bricks": torch.cat([uniform, tables.fine]),
-            "first_plane": tables.first_plane,
-            "planes": tables.planes,
-            "clearance": tables.clearance,
-            "scale": scale.float().view(1, 1),
-            "shift": shift.float().view(3, 1),
-            "center": center.float().view(3, 1),
-            "half_extent": half_extent.float(),
-        }
         # No buffers: data-parallel training sends every buffer to all ranks before each step, and
         # its back ends know no int16. Each rank derives the same from the gate.
-        self._derived = tuple(derived)
-        for name, tensor in derived.items():
-            setattr(self, name, tensor)
+        self.held = tables._replace(fine=torch.cat([uniform, tables.fine]))
+        """The tables, with `UNIFORM` bricks in front of the others."""
+        self.frame = torch.cat([scale, shift, center, half_extent]).float()
+        """Scale and shift [3] to coarse cells, centre [3] and half extent of the space: [8]."""
         self.to(tables.coarse.device)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> CellCache:
         """What moving a module does to its tensors (`to`, `cpu`, `cuda`)."""
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
-        for name in self._derived:
-            setattr(self, name, fn(getattr(self, name)))
+        self.held, self.frame = Tables(*map(fn, self.held)), fn(self.frame)
         return self
-
-    @property
-    def frame(self) -> Tensor:
-        """Scale and shift [3] to coarse cells, centre [3] and half extent of the space: [8]."""
-        given = self.scale, self.shift, self.center, self.half_extent
-        return torch.cat([part.view(-1) for part in given])
 
     def tables(self) -> Tables:
         """The tables, where they are now."""
-        return Tables(
-            self.coarse, self.bricks[UNIFORM:], self.first_plane, self.planes, self.clearance
-        )
+        return self.held._replace(fine=self.held.fine[UNIFORM:])
 
     def decide(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Decisions as far as cells know them.
@@ -174,12 +144,12 @@ class CellCache(nn.Module):
             occupied bool [N], False where open; and the indices of positions that are left open,
             int64 [n_open]: the gate's to answer.
         """
-        cells = self._cells(positions, BRICK)
+        tables, cells = self.held, self._cells(positions, BRICK)
         corners = cells.to(torch.int32)
         coarse = _flat(corners >> BRICK_BITS, self.resolution + 2)
-        brick = self.coarse.index_select(0, coarse).to(torch.int32)
+        brick = tables.coarse.index_select(0, coarse).to(torch.int32)
         at = torch.add(_flat(corners.bitwise_and_(BRICK - 1), BRICK), brick, alpha=BRICK**3)
-        known = self.bricks.view(-1).index_select(0, at.add_(UNIFORM * BRICK**3))
+        known = tables.fine.view(-1).index_select(0, at.add_(UNIFORM * BRICK**3))
         # An answer in the type of what is compared is found ten times faster on a CPU than a bool.
         occupied = torch.eq(known, FINE_OCCUPIED, out=torch.empty_like(known)).view(torch.bool)
         mixed = torch.lt(known, FINE_EMPTY, out=torch.empty_like(known)).view(torch.bool)
@@ -187,8 +157,8 @@ class CellCache(nn.Module):
         if chosen.numel() == 0:
             return occupied, chosen
 
-        plane = self.first_plane.index_select(0, brick.index_select(0, chosen))
-        plane = self.planes.index_select(1, plane.add_(known.index_select(0, chosen))).float()
+        plane = tables.first_plane.index_select(0, brick.index_select(0, chosen))
+        plane = tables.planes.index_select(1, plane.add_(known.index_select(0, chosen))).float()
         offset, *slopes, error = plane
         within = cells.index_select(1, chosen).frac_().mul_(2.0).sub_(1.0)
         for slope, along in zip(slopes, within, strict=True):
@@ -212,7 +182,7 @@ class CellCache(nn.Module):
         index = _flat(inner, width).to(torch.int32)
         # From the middle of the cell that answers, in cells: over 1/2 outside the cube.
         aside = halves.sub_(inner).sub_(0.5).abs_().amax(dim=0)
-        pair = self.clearance.index_select(0, index >> 1)
+        pair = self.held.clearance.index_select(0, index >> 1)
         clear = pair.bitwise_right_shift_((index & 1).mul_(4).to(torch.uint8)).bitwise_and_(15)
         # The cell itself is the first of the empty ones that are counted.
         reach = (radii * self._stretch(positions, radii)).mul_(2.0)
@@ -224,11 +194,12 @@ class CellCache(nn.Module):
         The contraction f(x) = x (2 - 1/m) / m, m = max|x|, has Jacobian rows whose absolute sum is
         at most (4m - 3) / m^2, which grows to 4/3 at m = 3/2 and falls after.
         """
+        scale, half_extent = self.frame[0], self.frame[7]
         if not self.contracted:
-            return self.scale[0]
-        distance = (positions.T - self.center).abs().amax(dim=0)
-        inner = ((distance - radii) / self.half_extent).clamp(min=1.5)
-        return (0.5 / self.half_extent) * self.scale[0] * (4.0 * inner - 3.0) / inner.square()
+            return scale
+        distance = (positions.T - self.frame[4:7, None]).abs().amax(dim=0)
+        inner = ((distance - radii) / half_extent).clamp(min=1.5)
+        return (0.5 / half_extent) * scale * (4.0 * inner - 3.0) / inner.square()
 
     def _cells(self, positions: Tensor, parts: int) -> Tensor:
         """Coordinates in so many parts of coarse cells, a power of two; [3, N].
@@ -236,9 +207,9 @@ class CellCache(nn.Module):
         The border is the first and the last coarse cell.
         """
         if self.contracted:
-            scaled = (positions - self.center.view(3)) / self.half_extent
-            positions = contract(scaled) * 0.5
-        cells = torch.addcmul(self.shift * parts, positions.T, self.scale * parts)
+            positions = contract((positions - self.frame[4:7]) / self.frame[7]) * 0.5
+        scale, shift = self.frame[0], self.frame[1:4, None]
+        cells = torch.addcmul(shift * parts, positions.T, scale * parts)
         return cells.nan_to_num_(nan=0.0).clamp_(0.0, parts * (self.resolution + 1.5))
 
 

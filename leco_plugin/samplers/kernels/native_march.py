@@ -21,7 +21,7 @@ CANDIDATES_AT_ONCE = 1 << 22
 def march(occupied: OccupiedFn, cache: CellCache | None, rays: Rays, rule: March) -> Samples | None:
     """The candidates that a frozen gate keeps, by its decisions and cells of them; None: ask the
     torch twin. ValueError as of `marching.march`."""
-    if cache is None or not native.suits(rays.origins, cache.scale):
+    if cache is None or not native.suits(rays.origins, cache.frame):
         return None
     candidates, _, longest = plan(rays, rule)
     if not rule.fits_kernels:
@@ -60,7 +60,7 @@ def _march(cache: CellCache, candidates: Candidates) -> tuple[Samples, Tensor]:
         "t_ends": torch.empty(total),
         "open": torch.empty(total, dtype=torch.bool),
     }
-    coarse, _, first_plane, planes, clearance = cache.tables()
+    coarse, bricks, first_plane, planes, clearance = cache.held
     rooms = room.cumsum(0) - room
     found = native.call_along_rays(
         "march_cells",
@@ -72,7 +72,7 @@ def _march(cache: CellCache, candidates: Candidates) -> tuple[Samples, Tensor]:
             "rooms": rooms,
             "coarse": coarse,
             "first_plane": first_plane,
-            "bricks": cache.bricks,
+            "bricks": bricks,
             "clearance": clearance,
             "planes": planes.contiguous(),
             "frame": cache.frame,
