@@ -1,4 +1,4 @@
-"""Occupancy grids of a trained field, each refined from one half as fine.
+"""Occupancy grids of a trained field, each refined from the one before if that is half as fine.
 
 Densities are evaluated only in cells that the coarser grid, or a neighbour there, has not ruled
 out. The time for 512^3 cells therefore depends on how much surface they hold.
@@ -26,8 +26,6 @@ of which a surface may fill a corner."""
 CELLS_AT_ONCE = 1 << 18
 BYTES_A_CELL = 16
 """Of memory while a grid is filled, about."""
-ASK_ALL = 64
-"""Cells along an axis up to which a grid may be filled without a coarser one."""
 
 Density = Callable[[Tensor], Tensor]
 """Of mapped positions [N, 3]: [N]."""
@@ -54,27 +52,17 @@ class FieldGrids:
 
     def fill(self, cells: int) -> Tensor | None:
         """Scores [n, n, n] of a grid with n = `cells` along each axis; None where it would ask more
-        than `most`. The grid filled before is refined if it is half as fine."""
-        steps = halvings(cells, 0 if self.scores is None else len(self.scores))
-        if self.scores is None or 2 * len(self.scores) != steps[0]:
-            self.scores, self.floor, self.clock = None, 0.0, Clock()
+        than `most`. The grid filled before is refined if it is half as fine; else all cells are
+        asked."""
+        if self.scores is not None and 2 * len(self.scores) != cells:
+            self.scores, self.clock = None, Clock()
         with self.clock.running():
-            for step in steps:
-                asked = cells_to_ask(step, self.scores, self.floor, self.box.low.device)
-                if int(asked.sum()) * probes_in_a_cell(step) > self.most:
-                    return None
-                self.scores = fill_cells(self.density, self.box, asked, known=self.known)
-                self.floor = self.floor_of(self.scores)
+            asked = cells_to_ask(cells, self.scores, self.floor, self.box.low.device)
+            if int(asked.sum()) * probes_in_a_cell(cells) > self.most:
+                return None
+            self.scores = fill_cells(self.density, self.box, asked, known=self.known)
+            self.floor = self.floor_of(self.scores)
         return self.scores
-
-
-def halvings(cells: int, known: int) -> list[int]:
-    """Cells along an axis of the grids to fill on the way to one, from the known grid on, coarse to
-    fine."""
-    steps = [cells]
-    while steps[0] > ASK_ALL and steps[0] % 2 == 0 and steps[0] != 2 * known:
-        steps.insert(0, steps[0] // 2)
-    return steps
 
 
 def cells_to_ask(

@@ -15,7 +15,6 @@ from leco_plugin.evaluation.field_grids import (
     cells_to_ask,
     fill_cells,
     fits_memory,
-    halvings,
     look_up_scores,
     octree_bytes,
 )
@@ -121,17 +120,6 @@ def test_known_places_count_like_a_loop_over_them() -> None:
             cell = tuple((shares * torch.tensor([4, 3, 2])).long().tolist())
             expected[cell] = max(float(expected[cell]), float(density))
     torch.testing.assert_close(found, expected)
-
-
-@pytest.mark.parametrize(
-    ("cells", "known", "steps"),
-    [
-        *((32, 0, [32]), (64, 32, [64]), (512, 0, [64, 128, 256, 512]), (512, 128, [256, 512])),
-        *((100, 0, [50, 100]), (75, 50, [75])),
-    ],
-)
-def test_a_fine_grid_is_reached_by_halves(cells: int, known: int, steps: list[int]) -> None:
-    assert halvings(cells, known) == steps
 
 
 def test_a_grid_serves_the_next_one_only_if_that_is_twice_as_fine() -> None:
