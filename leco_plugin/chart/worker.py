@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -57,15 +56,7 @@ def train_job(
     from leco_plugin.chart.contender import config_of
     from leco_plugin.evaluation.equal_loss import take_occupancy
     from leco_plugin.evaluation.timed_run import timed_run
-    from leco_plugin.models.leco import LecoModel
     from leco_plugin.scenes.scene_file import file_in
-
-    frozen: dict[str, Any] = {}
-
-    def when_frozen(trainer: Trainer) -> None:
-        model: Any = trainer.pipeline.model
-        if isinstance(model, LecoModel) and not model.config.schedule.restart:
-            frozen.update(_weights_of(model.mixture))
 
     budget = protocol.budget()
     place = folder / "nerfstudio"
@@ -78,45 +69,42 @@ def train_job(
         curve_points=protocol.curve_points if looked_at else 0,
         images=protocol.images if looked_at else 0,
         on_progress=on_progress,
-        on_frozen=when_frozen,
     )
     left = take_occupancy(trainer, file_in(data).parent, folder)
     facts = None if left is None else left[1]
     if facts is not None:
-        facts["at_equal_loss"] = _at_freezing(trainer, frozen, contender)
+        facts["at_equal_loss"] = _at_freezing(trainer, contender)
         facts["learn_seconds"] = run.learn_seconds
     return {**run.to_dict(), "name": contender.name, "occupancy": facts}, trainer
 
 
-def _weights_of(mixture: Any) -> dict[str, Any]:
-    return {name: copy.deepcopy(getattr(mixture, name).state_dict()) for name in ("gate", "field")}
-
-
-def _at_freezing(
-    trainer: Trainer, frozen: dict[str, Any], contender: Contender
-) -> dict[str, Any] | None:
-    """What `compare_at_freezing` finds with the weights of the moment of freezing; None without.
+def _at_freezing(trainer: Trainer, contender: Contender) -> dict[str, Any] | None:
+    """What `compare_at_freezing` finds with the field of the moment of freezing; None without.
     Measured after the run, so that neither its time nor its random numbers change."""
-    if not frozen:
-        return None
+    import torch
+
+    from leco_plugin.learning.freezing import field_at_freezing
+    from leco_plugin.models.leco import LecoModel
+
     model: Any = trainer.pipeline.model
-    mixture = model.mixture
-    now, small = _weights_of(mixture), mixture.small
-
-    def load(found: dict[str, Any]) -> None:
-        for name, weights in found.items():
-            getattr(mixture, name).load_state_dict(weights)
-
-    mixture.small = None
-    load(frozen)
+    if not isinstance(model, LecoModel) or model.config.schedule.restart:
+        return None
+    now = model.mixture
     try:
+        with torch.random.fork_rng():
+            frozen = field_at_freezing(now, trainer.base_dir)
+        if frozen is None:
+            return None
+        for number, remains in enumerate(now.field.experts.left.tolist(), 1):
+            if not remains:  # which left just after
+                frozen.field.experts.drop(number)
+        model.mixture = frozen
         return compare_at_freezing(model, trainer.pipeline.datamanager, contender)
     except ValueError as error:  # the run itself is whole
         print(error)
         return None
     finally:
-        load(now)
-        mixture.small = small
+        model.mixture = now
 
 
 def compare_at_freezing(model: Any, datamanager: Any, contender: Contender) -> dict[str, Any]:

@@ -116,7 +116,6 @@ def timed_run(
     curve_points: int = 6,
     images: int = 2,
     on_progress: Callable[[float], None] | None = None,
-    on_frozen: Callable[[Trainer], None] | None = None,
 ) -> tuple[TimedRun, Trainer]:
     """Trains until the budget is used and evaluates on the test images.
 
@@ -132,7 +131,6 @@ def timed_run(
         images: whole test images rendered at the end, for SSIM, FLIP, LPIPS and the rendering
             time; none leaves those out.
         on_progress: called with the share of the budget that is used, after each step.
-        on_frozen: called off the clock when a model that learns its occupancy itself has frozen it.
     Returns:
         The record, and the trainer with its model.
     Raises:
@@ -146,7 +144,7 @@ def timed_run(
     run = TimedRun(config.method_name or "", sampler, seed)
     model = trainer.pipeline.model
     with count_queries(model) as queries:
-        course = _Course(trainer, budget, run, queries, curve_points, on_progress, on_frozen)
+        course = _Course(trainer, budget, run, queries, curve_points, on_progress)
         run_training(trainer)
         course.end()
         if curve_points:
@@ -195,7 +193,6 @@ class _Course:
     queries: Counter[str]
     curve_points: int
     on_progress: Callable[[float], None] | None
-    on_frozen: Callable[[Trainer], None] | None
 
     def __post_init__(self) -> None:
         self.clock = Clock()
@@ -240,8 +237,6 @@ class _Course:
             run.train_queries[kind] += count - self.before_step[kind]
         if frozen_now:
             self.step_times.clear()
-            if self.on_frozen is not None:
-                self.on_frozen(self.trainer)
         else:
             self.step_times.append(seconds)
         run.steps = step + 1

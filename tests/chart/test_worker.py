@@ -20,7 +20,9 @@ from leco_plugin.chart.methods import SUITES
 from leco_plugin.chart.runner import FAILURE, JOB, PROGRESS, RESULT
 from leco_plugin.chart.worker import main, run_job, train_job
 from leco_plugin.evaluation import equal_loss, timed_run
+from leco_plugin.learning.freezing import leave_field
 from leco_plugin.models.gate import Gate, GateConfig
+from leco_plugin.models.leco import LecoModel
 
 SMALL = {
     "sizes.field.encoding.levels": 2,
@@ -245,19 +247,56 @@ def test_every_contender_can_be_trained(one: Contender, tiny_scene: Path, tmp_pa
     assert (run["occupancy"] is not None) == one.sampler.startswith("learned-occupancy")
 
 
-def test_at_freezing_the_large_gate_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
-    mixture = small_mixture()
-    at_freezing = worker._weights_of(mixture)
+def test_at_freezing_the_large_gate_is_measured(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    model, trainer = a_frozen_run(tmp_path)
+    mixture = model.mixture
     small, head = Gate(GateConfig(width=8, layers=1)), mixture.gate.head.bias.detach().clone()
+    color = next(mixture.field.color.parameters())
+    shown = color.detach().clone()
     mixture.sharpen(small, 0.3, {})
-    mixture.gate.head.bias.add_(1.0)
+    mixture.field.experts.drop(1)
+    with torch.no_grad():
+        color.add_(1.0)
 
     def compared(model: Any, *_: Any) -> dict[str, Any]:
-        assert model.mixture.small is None and torch.equal(model.mixture.gate.head.bias, head)
-        return {"grids": []}
+        then = model.mixture
+        assert then.small is None and torch.equal(then.gate.head.bias, head)
+        assert torch.equal(next(then.field.color.parameters()), shown)
+        assert torch.equal(then.field.experts.left, mixture.field.experts.left)
+        return {"grids": [], "drawn": float(torch.rand(()))}
 
     monkeypatch.setattr(worker, "compare_at_freezing", compared)
-    pipeline = SimpleNamespace(model=SimpleNamespace(mixture=mixture), datamanager=None)
-    trainer: Any = SimpleNamespace(pipeline=pipeline)
-    assert worker._at_freezing(trainer, at_freezing, ONE) == {"grids": []}
-    assert mixture.small is small and torch.equal(mixture.gate.head.bias, head + 1.0)
+    torch.manual_seed(3)
+    drawn = float(torch.rand(()))
+    torch.manual_seed(3)
+    assert worker._at_freezing(trainer, ONE) == {"grids": [], "drawn": drawn}
+    assert model.mixture is mixture and mixture.small is small and torch.equal(color, shown + 1.0)
+
+
+def test_a_run_whose_rays_see_no_surface_is_whole(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def compared(*_: Any) -> dict[str, Any]:
+        raise ValueError("no surface is seen")
+
+    model, trainer = a_frozen_run(tmp_path)
+    mixture = model.mixture
+    monkeypatch.setattr(worker, "compare_at_freezing", compared)
+    assert worker._at_freezing(trainer, ONE) is None and model.mixture is mixture
+    assert capsys.readouterr().out == "no surface is seen\n"
+
+
+def a_frozen_run(folder: Path) -> tuple[Any, Any]:
+    """A model that has left its field in a folder, and its trainer."""
+    mixture = small_mixture()
+    mixture.freeze(0.2, {})
+    leave_field(mixture, folder)
+    model: Any = LecoModel.__new__(LecoModel)
+    torch.nn.Module.__init__(model)
+    model.mixture = mixture
+    model.config = SimpleNamespace(schedule=SimpleNamespace(restart=False))
+    return model, SimpleNamespace(
+        base_dir=folder, pipeline=SimpleNamespace(model=model, datamanager=None)
+    )

@@ -44,7 +44,7 @@ def course_of(model: Any) -> tuple[_Course, Any]:
         callbacks=[],
     )
     run = TimedRun("method", "sampler", 0)
-    course = _Course(trainer, Budget(100.0), run, Counter(), 0, None, None)
+    course = _Course(trainer, Budget(100.0), run, Counter(), 0, None)
     return course, optimizer.param_groups[0]
 
 
