@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from leco_plugin.capacity.sources import Seen
-from leco_plugin.evaluation.field_grids import in_parts
+from leco_plugin.evaluation.inspection import in_parts
 from leco_plugin.learning.calibration import EXACT, price_db
 from leco_plugin.learning.dense import in_chunks, near_surface, weights_by_ray
 from leco_plugin.models.mixture import Mixture

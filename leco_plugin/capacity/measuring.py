@@ -7,7 +7,6 @@ import random
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from pickle import UnpicklingError
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -25,13 +24,14 @@ from leco_plugin.evaluation.clock import seconds_now
 from leco_plugin.evaluation.field_grids import fits_memory, largest_in_cells
 from leco_plugin.evaluation.inspection import ViewBox, in_parts
 from leco_plugin.evaluation.report import describe_code, describe_machine, made_by, read_object
+from leco_plugin.learning.freezing import load_state
 from leco_plugin.learning.sharpening import Lesson, lesson_from_field, teach
 from leco_plugin.log import bar, put
 from leco_plugin.models.gate import GateConfig, occupancy_logit
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.occupancy import Precision, gate_precision
-from leco_plugin.scenes.input_error import InputError, one_line, require_folder
+from leco_plugin.scenes.input_error import InputError, require_folder
 from leco_plugin.scenes.photographs import describe_scene
 from leco_plugin.scenes.whole_files import alone_in, write_json, write_whole
 
@@ -89,13 +89,8 @@ def prepare(data: Path, folder: Path, learn_steps: int) -> Taught:
         metadata=dataset.metadata,
         device=device,
     ).to(device)
-    try:
-        model.load_state_dict(torch.load(stored, map_location=model.device, weights_only=True))
-    except (OSError, RuntimeError, ValueError, KeyError, EOFError, UnpicklingError) as error:
-        raise InputError(
-            f"{stored} cannot be used ({one_line(error, 200)}): name a new folder with --out, or "
-            f"delete {stored} and the points beside it"
-        ) from None
+    beside = f"name a new folder with --out, or delete {stored} and the points beside it"
+    load_state(model, stored, model.device, beside)
     return _render_rays(manager, model.eval())
 
 

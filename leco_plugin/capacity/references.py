@@ -29,6 +29,7 @@ from leco_plugin.capacity.evidence import (
     worst,
 )
 from leco_plugin.capacity.sources import Seen, Source, draw_other_pixels, move_between_cameras
+from leco_plugin.evaluation.inspection import in_parts
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.occupancy import Occupancy
 
@@ -93,15 +94,29 @@ class Ground(NamedTuple):
         """Whether a reference measures the original itself."""
         return not all(reference.guided for reference in self.references)
 
-    def losses(self, gate: Occupancy, side: str, unlikely: float) -> list[Loss]:
-        """What a gate loses in all, by each reference, on its side `search` or `verify`; the bounds
-        may be wrong as often as is `unlikely`."""
+    def scores(self, gate: Occupancy, side: str) -> list[Tensor | None]:
+        """o(x) of a gate at the candidates [M] of each reference, on its side `search` or `verify`;
+        None where it is the original and guides: it loses exactly what it declares."""
+        return [
+            None
+            if gate is self.original and one.guided
+            else in_parts(gate.query, getattr(one, side).evidence.positions)
+            for one in self.references
+        ]
+
+    def losses(
+        self,
+        gate: Occupancy,
+        side: str,
+        unlikely: float,
+        scores: Sequence[Tensor | None] | None = None,
+    ) -> list[Loss]:
+        """What a gate loses in all, by each reference; the bounds may be wrong as often as is
+        `unlikely`. `scores` are those of the gate, where they are known."""
         found = []
-        for one in self.references:
-            part: Part = getattr(one, side)
-            guides = gate is self.original and one.guided  # it loses exactly what it declares
-            skipped = None if guides else find_skipped(gate, part.evidence)
-            found.append(one.loss_of(part, skipped, unlikely))
+        for one, score in zip(self.references, scores or self.scores(gate, side)):
+            skipped = None if score is None else score < gate.threshold
+            found.append(one.loss_of(getattr(one, side), skipped, unlikely))
         return found
 
     def price(self, gate: Occupancy, side: str) -> float | None:

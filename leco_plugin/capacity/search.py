@@ -15,11 +15,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from leco_plugin.capacity.evidence import Evidence, Loss, unlikely_at, worst
-from leco_plugin.capacity.references import Bounds, Ground, Reference, Rung, verify
+from leco_plugin.capacity.evidence import Evidence, unlikely_at, worst
+from leco_plugin.capacity.references import Bounds, Ground, Rung, verify
 from leco_plugin.evaluation.clock import seconds_now
-from leco_plugin.evaluation.field_grids import in_parts
-from leco_plugin.evaluation.inspection import whole_box
+from leco_plugin.evaluation.inspection import in_parts, whole_box
 from leco_plugin.learning.calibration import thresholds_below
 from leco_plugin.learning.sharpening import Lesson, teach
 from leco_plugin.models.encodings import EncodingConfig, Kind
@@ -224,14 +223,13 @@ def _measure(
     The original keeps a share `kept` of places `volume` [P, 3] in its box. A look at the verifying
     rays would have the number `look`.
     """
-    losses_at = _losses_of(smaller, ground.references)
-    of_volume = in_parts(smaller.query, volume)
+    scores, of_volume = ground.scores(smaller, "search"), in_parts(smaller.query, volume)
     lost, holds, ratio = 0.0, False, 0.0
     for share in VOLUMES:
-        threshold = find_threshold(of_volume, share * kept)
-        losses = losses_at(threshold, look)
+        smaller = smaller.with_threshold(find_threshold(of_volume, share * kept))
+        losses = ground.losses(smaller, "search", unlikely_at(look), scores)
         lost = max(one.share for one in losses)
-        ratio = float((of_volume >= threshold).double().mean()) / max(kept, 1e-12)
+        ratio = float((of_volume >= smaller.threshold).double().mean()) / max(kept, 1e-12)
         # what is not within the bounds here needs no look at the rays that verify
         holds = all(
             one.bound <= bounds.lost_surface_mass
@@ -241,7 +239,6 @@ def _measure(
         )
         if holds:
             break
-    smaller = smaller.with_threshold(threshold)
     config = smaller.gate.config
     params = values_of(config)
     rung = Rung(name_of(config), params, 2 * params, round(ratio, 4), lost, None, "", 0.0)
@@ -259,21 +256,6 @@ def _measure(
     return rung, smaller
 
 
-def _losses_of(
-    gate: Occupancy, references: Sequence[Reference]
-) -> Callable[[float, int], list[Loss]]:
-    """What a gate loses on the rays of the search, by each reference, at a threshold and a look."""
-    scores = [in_parts(gate.query, one.search.evidence.positions) for one in references]
-
-    def losses_at(threshold: float, look: int) -> list[Loss]:
-        return [
-            one.loss_of(one.search, found < threshold, unlikely_at(look))
-            for one, found in zip(references, scores)
-        ]
-
-    return losses_at
-
-
 def lower_threshold(ground: Ground, bounds: Bounds) -> Occupancy | None:
     """The original at the largest lower threshold that meets what is asked of a smaller gate.
 
@@ -286,10 +268,10 @@ def lower_threshold(ground: Ground, bounds: Bounds) -> Occupancy | None:
     """
     original = ground.original
     absolute = ground._replace(references=[one for one in ground.references if not one.guided])
-    losses_at = _losses_of(original, absolute.references)
+    scores = absolute.scores(original, "search")
 
     def meets(there: Occupancy) -> bool:
-        lost = worst(losses_at(there.threshold, 1))
+        lost = worst(absolute.losses(there, "search", unlikely_at(1), scores))
         if lost.share > MARGIN * bounds.lost_surface_mass or not bounds.allow(lost.bound, None):
             return False  # before anything is rendered
         return bounds.allow(lost.bound, absolute.price(there, "search"))

@@ -10,16 +10,16 @@ import copy
 import shutil
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any
 
 import torch
+from torch import nn
 
 from leco_plugin.learning.calibration import Measured
 from leco_plugin.learning.run import folder_of
 from leco_plugin.log import note, say
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.occupancy import Occupancy
-from leco_plugin.scenes.input_error import one_line
+from leco_plugin.scenes.input_error import InputError, one_line
 from leco_plugin.scenes.whole_files import write_whole
 
 FILE_NAME = "occupancy.safetensors"
@@ -114,12 +114,16 @@ def field_at_freezing(mixture: Mixture, folder: Path) -> Mixture | None:
     if not path.is_file():
         return None
     frozen = copy.deepcopy(mixture)
-    try:
-        state: dict[str, Any] = torch.load(path, map_location=mixture.device, weights_only=True)
-        frozen.load_state_dict(state)
-    except (OSError, RuntimeError, ValueError, KeyError, EOFError, UnpicklingError) as error:
-        line = one_line(error, 200)
-        raise ValueError(f"{path} cannot be used ({line}): move it away") from None
+    load_state(frozen, path, mixture.device, "move it away")
     if not frozen.gate.decides_as(mixture.gate):
         raise ValueError(f"{path} is of another gate than the run's last checkpoint: move it away")
     return frozen.eval()
+
+
+def load_state(module: nn.Module, file: Path, device: torch.device, remedy: str) -> None:
+    """Gives a module the state in a file. InputError, in one line with the remedy, if the file is
+    damaged or its state that of another module."""
+    try:
+        module.load_state_dict(torch.load(file, map_location=device, weights_only=True))
+    except (OSError, RuntimeError, ValueError, KeyError, EOFError, UnpicklingError) as error:
+        raise InputError(f"{file} cannot be used ({one_line(error, 200)}): {remedy}") from None

@@ -243,12 +243,14 @@ def test_a_gate_is_within_half_of_the_bound_at_about_the_volume_of_the_original(
 ) -> None:
     """It has one score everywhere, and keeps all of the volume of which the original keeps some."""
     found, looks = Loss(share, bound, 0.0), []
-    monkeypatch.setattr(searching, "_losses_of", lambda *_: lambda threshold, look: [found])
     monkeypatch.setattr(searching, "verify", lambda *given: looks.append(given[-1]) or True)
     gate = Occupancy(ball().gate, ball().space, 0.1).eval()
     monkeypatch.setattr(gate, "query", lambda places: torch.full((len(places),), 0.25))
     known: Any = SimpleNamespace(
-        references=[SimpleNamespace(lost_before=before)], price=lambda *_: price
+        references=[SimpleNamespace(lost_before=before)],
+        price=lambda *_: price,
+        scores=lambda *_: [],
+        losses=lambda *_: [found],
     )
     rung, placed = searching._measure(known, gate, Bounds(1e-3), torch.zeros(50, 3), kept, 3)
     assert (rung.verdict, rung.lost_surface_mass) == (verdict, share)
