@@ -22,7 +22,7 @@ from leco_plugin.chart.theme import DARK, LIGHT
 from leco_plugin.evaluation import equal_loss
 from leco_plugin.evaluation.clock import seconds_now
 from leco_plugin.evaluation.field_grids import fits_memory, largest_in_cells
-from leco_plugin.evaluation.inspection import ViewBox, in_parts
+from leco_plugin.evaluation.inspection import ViewBox
 from leco_plugin.evaluation.report import describe_code, describe_machine, made_by, read_object
 from leco_plugin.learning.freezing import load_state
 from leco_plugin.learning.sharpening import Lesson, lesson_from_field, teach
@@ -50,11 +50,8 @@ class Taught(NamedTuple):
     lesson: Lesson
     held_out: Evidence
     """Dense candidates of pixels that nothing was trained on."""
-    mapped: Tensor
-    """[M, 3] of those candidates, in [-1, 1]."""
-    volume: Tensor
-    """[P, 3] mapped, spread evenly over the part of the scene's box that rays reach. Elsewhere
-    nothing is taught."""
+    ground: equal_loss.Ground
+    """Those candidates, and places that rays reach: elsewhere nothing is taught."""
 
 
 def prepare(data: Path, folder: Path, learn_steps: int) -> Taught:
@@ -107,7 +104,8 @@ def _render_rays(manager: Any, model: LecoModel) -> Taught:
         )
     volume = equal_loss.reached_volume(mixture, lesson.mapped, VOLUME_POINTS, seed=5)
     mapped = mixture.region.space.map(evidence.positions).clamp(-1.0, 1.0)
-    return Taught(mixture, lesson, evidence, mapped, volume)
+    ground = equal_loss.Ground(equal_loss.mapped_box(mixture), mapped, evidence.worth, volume)
+    return Taught(mixture, lesson, evidence, ground)
 
 
 def lesson_of(manager: Any, model: LecoModel) -> Lesson:
@@ -148,13 +146,17 @@ def lost_where(worth: Tensor, scores: Tensor, of_volume: Tensor, share: float) -
 
 def measure_candidate(taught: Taught, candidate: Candidate, lost: float) -> dict[str, Any]:
     """Teaches a gate or a grid and measures it, as it would be stored and asked."""
-    started = seconds_now()
+    started, ground = seconds_now(), taught.ground
+    score: Callable[[Tensor], Tensor] | Tensor
     if candidate.gate is None:
-        found = _measure_grid(taught, candidate, lost)
+        score = taught_grid(taught.lesson, ground.box, int(candidate.size))
     else:
         score = taught_score(candidate.gate, taught.lesson, taught.mixture.precision)
-        scores, of_volume = in_parts(score, taught.mapped), in_parts(score, taught.volume)
-        found = measure(taught.held_out, scores, of_volume, lost)
+    rows = [
+        measure(taught.held_out, *scores, lost) | facts
+        for *scores, facts in ground.scores_of(score, lost)
+    ]
+    found = min(rows, key=lambda one: one["kept_volume"])  # a grid may keep less dilated
     seconds = round(seconds_now() - started, 2)
     named = {"family": candidate.family, "size": candidate.size, "bytes": candidate.bytes}
     return {**named, "seconds": seconds, **found}
@@ -173,18 +175,6 @@ def taught_score(
             return occupancy_logit(gate(mapped))
 
     return score
-
-
-def _measure_grid(taught: Taught, candidate: Candidate, lost: float) -> dict[str, Any]:
-    """What a taught grid keeps and loses, dilated by a cell where it keeps less so."""
-    box = equal_loss.mapped_box(taught.mixture)
-    scores = taught_grid(taught.lesson, box, int(candidate.size))
-    places = taught.mapped, taught.volume, taught.held_out.worth
-    both = [
-        measure(taught.held_out, of_rays, of_volume, lost) | {"octree_bytes": size}
-        for of_rays, of_volume, size in equal_loss.plain_and_dilated(scores, box, *places, lost)
-    ]
-    return min(both, key=lambda one: one["kept_volume"])
 
 
 def taught_grid(lesson: Lesson, box: ViewBox, cells: int) -> Tensor:

@@ -101,7 +101,7 @@ def at_equal_loss(
             raise ValueError("no surface is seen by the held-out rays, so that none can be lost")
         taught = candidates_of(mixture, rays_of_photographs(datamanager, TAUGHT_RAYS))
         volume = reached_volume(mixture, taught, VOLUME_POINTS)
-        ground = _Ground(mapped_box(mixture), mapped, weights, volume)
+        ground = Ground(mapped_box(mixture), mapped, weights, volume)
         kept = ground.kept_by(occupancies, in_parts(mixture.occupancies, volume))
         beside = {name: ground.kept_by_score(score) for name, score in (others or {}).items()}
         rows, left_out = _kept_by_grids(mixture, grids, taught, ground) if grids else ([], [])
@@ -115,7 +115,7 @@ def at_equal_loss(
     }
 
 
-class _Ground(NamedTuple):
+class Ground(NamedTuple):
     """What representations of one field are compared on."""
 
     box: ViewBox
@@ -132,17 +132,32 @@ class _Ground(NamedTuple):
         volume, candidates = kept_shares(self.weights, of_rays, of_volume, LOST_SURFACE_MASS)
         return {"kept_reached_volume": round(volume, 5), "kept_candidates": round(candidates, 5)}
 
-    def kept_by_score(self, score: Callable[[Tensor], Tensor] | Tensor) -> dict[str, Any]:
-        """The same of a function of mapped positions, or of a grid [n, n, n], as it is or dilated,
-        whichever keeps less."""
+    def scores_of(
+        self, score: Callable[[Tensor], Tensor] | Tensor, lost: float
+    ) -> Iterator[tuple[Tensor, Tensor, dict[str, int]]]:
+        """Scores of the candidates [M] and the places [P] by a function of mapped positions; or by
+        a grid [n, n, n] as it is, then dilated by a cell, each with the `octree_bytes` of what it
+        keeps where a share of the weights is lost."""
         if not isinstance(score, Tensor):
-            return self.kept_by(in_parts(score, self.mapped), in_parts(score, self.volume))
-        both = plain_and_dilated(score, *self[:2], self.volume, self.weights, LOST_SURFACE_MASS)
+            yield in_parts(score, self.mapped), in_parts(score, self.volume), {}
+            return
+        for cells in (score, field_grids.dilate(score)):
+            of_rays, of_volume = (
+                field_grids.look_up_scores(cells, self.box, places)
+                for places in (self.mapped, self.volume)
+            )
+            kept = cells >= threshold_losing(self.weights, of_rays, lost)
+            yield of_rays, of_volume, {"octree_bytes": field_grids.octree_bytes(kept)}
+
+    def kept_by_score(self, score: Callable[[Tensor], Tensor] | Tensor) -> dict[str, Any]:
+        """What is kept by a representation as of `scores_of`; by a grid `dilated` or as it is,
+        whichever keeps less."""
         rows = [
-            {"dilated": bool(dilated), **self.kept_by(*scores), "octree_bytes": size}
-            for dilated, (*scores, size) in enumerate(both)
+            self.kept_by(*scores) | facts
+            for *scores, facts in self.scores_of(score, LOST_SURFACE_MASS)
         ]
-        return min(rows, key=lambda one: one["kept_reached_volume"])
+        best = min(rows, key=lambda one: one["kept_reached_volume"])
+        return best | ({} if len(rows) == 1 else {"dilated": best is not rows[0]})
 
 
 def near_points(points: Tensor) -> Callable[[Tensor], Tensor]:
@@ -155,21 +170,8 @@ def near_points(points: Tensor) -> Callable[[Tensor], Tensor]:
     return score
 
 
-def plain_and_dilated(
-    scores: Tensor, box: ViewBox, mapped: Tensor, volume: Tensor, weights: Tensor, lost: float
-) -> Iterator[tuple[Tensor, Tensor, int]]:
-    """A grid of scores [n, n, n] as it is, then dilated by a cell: its scores of candidates [M, 3]
-    and of places `volume` [P, 3], and its octree's bytes where a share of the weights [M] is lost.
-    """
-    for cells in (scores, field_grids.dilate(scores)):
-        of_rays = field_grids.look_up_scores(cells, box, mapped)
-        of_volume = field_grids.look_up_scores(cells, box, volume)
-        kept = cells >= threshold_losing(weights, of_rays, lost)
-        yield of_rays, of_volume, field_grids.octree_bytes(kept)
-
-
 def _kept_by_grids(
-    mixture: Mixture, resolutions: Sequence[int], taught: Tensor, ground: _Ground
+    mixture: Mixture, resolutions: Sequence[int], taught: Tensor, ground: Ground
 ) -> tuple[list[dict[str, Any]], list[int]]:
     """Facts of grids of the field, which hold its density at the mapped places `taught` [M, 3] too;
     and the resolutions for which there is no memory or no time."""

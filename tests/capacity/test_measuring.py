@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import random
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -65,10 +67,16 @@ def test_a_cell_of_a_grid_has_the_largest_target_of_the_lesson_in_it() -> None:
 
 def test_a_row_says_how_long_a_representation_took(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(measuring, "seconds_now", iter([10.0, 12.5]).__next__)
-    monkeypatch.setattr(measuring, "_measure_grid", lambda *arguments: {"kept_volume": 0.5})
+    monkeypatch.setattr(measuring, "taught_grid", lambda *arguments: None)
+    kept = iter([0.5, 0.4]).__next__
+    monkeypatch.setattr(measuring, "measure", lambda *arguments: {"kept_volume": kept()})
+    both = [(None, None, {"octree_bytes": size}) for size in (3, 7)]
+    ground = SimpleNamespace(box=None, scores_of=lambda *arguments: both)
+    known: Any = SimpleNamespace(ground=ground, lesson=None, held_out=None)
     (grid,) = grids((4,))
-    row = measuring.measure_candidate(None, grid, 1e-3)
-    assert row == {"family": "grid", "size": "4", "bytes": 8, "seconds": 2.5, "kept_volume": 0.5}
+    row = measuring.measure_candidate(known, grid, 1e-3)
+    dilated = {"kept_volume": 0.4, "octree_bytes": 7}
+    assert row == {"family": "grid", "size": "4", "bytes": 8, "seconds": 2.5, **dilated}
 
 
 def test_resuming_has_the_same_rays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,6 +95,6 @@ def test_resuming_has_the_same_rays(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (first.lesson.mapped, again.lesson.mapped),
         (first.lesson.keep, again.lesson.keep),
         (first.held_out.positions, again.held_out.positions),
-        (first.volume, again.volume),
+        (first.ground.volume, again.ground.volume),
     ):
         assert torch.equal(one, other)
