@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -37,6 +37,7 @@ from leco_plugin.scenes.input_error import InputError
 from leco_plugin.swap import registered
 
 TAUGHT_GRID = f"{LEARNED}-grid"
+GATE_KIND = "sizes.gate.encoding.kind"
 SIZED_GRID = re.compile(rf"({GRID}|{TAUGHT_GRID})-(\d+)")
 
 LONGER = 4
@@ -181,7 +182,7 @@ def _contender_of(method: str, sampler: str) -> Contender | None:
 def _gate_of(sampler: str, spec: SamplerSpec, cells: int | None) -> tuple[str, dict[str, Any]]:
     """What a sampler is called in charts, and the changes that make a gate for it be learned."""
     shown, kind = SAMPLER_NAMES.get(sampler, sampler), spec.gate_encoding
-    changes: dict[str, Any] = {"sizes.gate.encoding.kind": kind} if kind else {}
+    changes: dict[str, Any] = {GATE_KIND: kind} if kind else {}
     if sampler == TAUGHT_GRID:
         usual = EncodingConfig().plane_cells
         shown = f"taught grid {cells or usual}³"
@@ -302,22 +303,17 @@ class Suite:
         return Protocol(self.seconds, steps, self.learn_seconds, at_once=AT_ONCE)
 
 
-def _leco(name: str, **changes: object) -> Contender:
-    """`leco-occupancy` with settings changed; `__` stands for the dots of their paths."""
-    paths = {path.replace("__", "."): value for path, value in changes.items()}
-    return Contender(name, "leco-occupancy", LEARNED, paths)
+def _leco(name: str, changes: Mapping[str, Any]) -> Contender:
+    """`leco-occupancy` with settings changed."""
+    return Contender(name, "leco-occupancy", LEARNED, changes)
 
 
-def _experts(name: str, **changes: object) -> Contender:
-    return _leco(name, **SEVERAL_EXPERTS, **changes)
+def _experts(name: str, changes: Mapping[str, Any]) -> Contender:
+    return _leco(name, {**SEVERAL_EXPERTS, **changes})
 
 
-def _paper(name: str, **changes: object) -> Contender:
-    return _experts(name, gate_loss__form="paper", gate_loss__fall_back=False, **changes)
-
-
-def _empty_mlp(layers: int) -> dict[str, object]:
-    experts = "sizes__field__experts__"
+def _empty_mlp(layers: int) -> dict[str, Any]:
+    experts = "sizes.field.experts."
     return {f"{experts}empty_expert": "mlp", f"{experts}empty_layers": layers}
 
 
@@ -329,15 +325,17 @@ def _switch(sampler: str) -> Contender:
 
 
 SCENE_SIZED = _empty_mlp(SCENE_LAYERS)
+PAPER = {"gate_loss.form": "paper", "gate_loss.fall_back": False}
+NO_DENSITY = PAPER | {"gate_loss.density": 0.0}
 OTHER_GATES = {"hash": "hash grid", "vm": "TensoRF planes", "k-planes": "K-planes"}
 
 SUITES = {
     "representations": Suite(
         "Is a small MLP the best place for an occupancy? (reviews 1 and 2)",
         (
-            replace(_leco("MLP on frequencies (ours)"), grids=MADE_GRIDS, taught=True),
+            replace(_leco("MLP on frequencies (ours)", {}), grids=MADE_GRIDS, taught=True),
             *(
-                replace(_leco(name, sizes__gate__encoding__kind=kind), sampler=f"{LEARNED}-{kind}")
+                Contender(name, "leco-occupancy", f"{LEARNED}-{kind}", {GATE_KIND: kind})
                 for kind, name in OTHER_GATES.items()
             ),
         ),
@@ -345,29 +343,27 @@ SUITES = {
     "empty-expert": Suite(
         "How small must the empty-space expert be, and what if there is none? (reviews 3 and 6)",
         (
-            _experts("identity (ours)"),
-            _experts("MLP of one layer", **_empty_mlp(1)),
-            _experts("as large as a scene expert", **SCENE_SIZED),
-            _experts("none: density is zero", sizes__field__experts__empty_expert="none"),
-            _paper("imbalance loss alone, identity", gate_loss__density=0.0),
-            _paper("imbalance loss alone, large", gate_loss__density=0.0, **SCENE_SIZED),
+            _experts("identity (ours)", {}),
+            _experts("MLP of one layer", _empty_mlp(1)),
+            _experts("as large as a scene expert", SCENE_SIZED),
+            _experts("none: density is zero", {"sizes.field.experts.empty_expert": "none"}),
+            _experts("imbalance loss alone, identity", NO_DENSITY),
+            _experts("imbalance loss alone, large", NO_DENSITY | SCENE_SIZED),
         ),
     ),
     "losses": Suite(
         "What do the losses of the gate do?",
         (
-            _experts("contribution (ours)"),
-            _paper("paper: imbalance and density"),
-            _paper("paper without density loss", gate_loss__density=0.0),
-            _paper(
-                "balanced as in Switch-NeRF", gate_loss__density=0.0, gate_loss__empty_ratio=None
-            ),
+            _experts("contribution (ours)", {}),
+            _experts("paper: imbalance and density", PAPER),
+            _experts("paper without density loss", NO_DENSITY),
+            _experts("balanced as in Switch-NeRF", NO_DENSITY | {"gate_loss.empty_ratio": None}),
         ),
     ),
     "freeze": Suite(
         "Why freeze and train again, instead of going on with the same network? (review 4)",
         (
-            _leco("learn, freeze, go on"),
+            _leco("learn, freeze, go on", {}),
             replace(VARIANTS["leco-occupancy-retrained"], name="learn, freeze, from scratch"),
             replace(NEVER_FROZEN, name="never frozen"),
             replace(VARIANTS["leco-occupancy-homogeneous"], name="equal experts, no gate"),
