@@ -28,9 +28,10 @@ from torch import Tensor
 
 from leco_plugin.chart.contender import Contender, Protocol
 from leco_plugin.chart.worker import main, train_job
-from leco_plugin.evaluation.metrics import decibels
+from leco_plugin.evaluation.metrics import psnr
 from leco_plugin.evaluation.report import finite_or_null
 from leco_plugin.evaluation.timed_run import render_rays
+from leco_plugin.learning.quality import psnr_of_one_colour
 from leco_plugin.samplers.registry import build_estimator
 from leco_plugin.stability.photographs import TRUTH
 from leco_plugin.stability.plan import DENSE_LEVELS, Sizes
@@ -115,7 +116,7 @@ def measure(
     pipeline.eval()
     scale = float(manager.train_dataparser_outputs.dataparser_scale)
     counts: list[tuple[int, ...]] = []
-    errors, detail_errors, colours = [], [], []
+    all_looked_at, details = [], []
     shown = None
     for number, file in enumerate(dataset.image_filenames):
         facts = np.load(data / TRUTH / f"{Path(file).stem}.npz")
@@ -132,22 +133,21 @@ def measure(
         rgb = render_rays(model, flat[asked.to(pipeline.device)], RAYS_AT_ONCE).cpu()
         image = dataset.get_data(number)["image"].reshape(len(flat), -1).to(pipeline.device)
         wanted = true_colours(model, image).float().cpu()
-        squared = (rgb - wanted[asked]).square()
-        colours.append(wanted[looked_at])
-        errors.append(squared[looked_at[asked]])
-        detail_errors.append(squared[detail[asked]])
+        both = torch.stack([rgb, wanted[asked]])
+        all_looked_at.append(both[:, looked_at[asked]])
+        details.append(both[:, detail[asked]])
         if shown is None:
             shown = (255 * rgb.view(height, width, 3)).round().byte().numpy()
     pipeline.train()
     lost, met, samples, candidates = map(sum, zip(*counts))
-    detail_error, colour = torch.cat(detail_errors), torch.cat(colours)
+    (rgb, colours), of_detail = torch.cat(all_looked_at, dim=1), torch.cat(details, dim=1)
     assert shown is not None
     found = Measured(
-        psnr(torch.cat(errors)),
+        psnr(rgb, colours),
         lost / met if met else None,
         samples / max(candidates, 1),
-        psnr(detail_error) if len(detail_error) else None,
-        psnr((colour - colour.mean(dim=0)).square()),
+        psnr(*of_detail) if of_detail.shape[1] else None,
+        psnr_of_one_colour(colours),
     )
     return found, shown
 
@@ -168,11 +168,6 @@ def count_lost(nearest: Tensor, depth: Tensor, shown_by: Tensor) -> tuple[int, i
     counts = shown_by >= FEWEST_VIEWS
     kept = nearest[counts] <= NEAR * depth[counts]  # not where a sample is nowhere
     return int((~kept).sum()), int(counts.sum())
-
-
-def psnr(squared_errors: Tensor) -> float:
-    """Of any number of squared errors, dB."""
-    return decibels(float(squared_errors.double().mean()))
 
 
 def find_samples(

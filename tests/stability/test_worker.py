@@ -37,7 +37,6 @@ from leco_plugin.stability.worker import (
     count_lost,
     find_samples,
     measure,
-    psnr,
     raster,
     run_cell,
 )
@@ -209,10 +208,6 @@ def test_a_raster_takes_its_share_of_every_row_and_every_column() -> None:
     taken = raster(9, 12).view(9, 12).float()
     for share in (taken.mean(dim=0), taken.mean(dim=1)):
         torch.testing.assert_close(share, torch.full_like(share, 1 / RASTER))
-
-
-def test_psnr_of_known_errors() -> None:
-    assert psnr(torch.full((5, 3), 0.01)) == pytest.approx(20.0)
 
 
 HEIGHT, WIDTH = 9, 12
