@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from leco_plugin.evaluation.report import read_object
-from leco_plugin.scenes.input_error import InputError, one_line
+from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.whole_files import LOCK, write_json, writing_into
 
 if TYPE_CHECKING:
@@ -285,34 +285,6 @@ def _reason(work: Path, status: int, log: Path) -> str:
     lines = log.read_text(errors="replace").split("\n")
     last = next((line.strip() for line in reversed(lines) if line.strip()), "it said nothing")
     return f"the process ended with status {status}: {last[:200]}"
-
-
-def work_on(folder: Path, make: Callable[..., dict[str, Any]]) -> int:
-    """Makes the job in a folder: the other side of `ProcessRunner`, called in its process.
-
-    `make` is called with the values of the job and what reports the share that is done. Its result
-    is left in the folder, or the reason why there is none; returns 0, or 1 on failure.
-    """
-    shown = 0.0
-
-    def show(share: float) -> None:
-        nonlocal shown
-        if share - shown >= 0.01:
-            shown = share
-            (folder / PROGRESS).write_text(f"{share:.3f}")
-
-    try:
-        write_json(folder / RESULT, make(json.loads((folder / JOB).read_text()), show))
-    # whatever a method raises is a row of the table, and the others go on
-    except BaseException as error:  # noqa: BLE001
-        import traceback
-
-        traceback.print_exc()
-        said = one_line(error)
-        reason = said if isinstance(error, ValueError) and said else None
-        write_json(folder / FAILURE, {"reason": reason or f"{type(error).__name__}: {said}"})
-        return 1
-    return 0
 
 
 def die_with_parent() -> None:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import sys
+import traceback
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from leco_plugin.chart.runner import die_with_parent, work_on
+from leco_plugin.chart.runner import FAILURE, JOB, PROGRESS, RESULT, die_with_parent
+from leco_plugin.scenes.input_error import one_line
+from leco_plugin.scenes.whole_files import write_json
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import Trainer, TrainerConfig
@@ -166,21 +170,38 @@ def compare_at_freezing(model: Any, datamanager: Any, contender: Contender) -> d
 
 
 def main(folder: Path, run: Callable[..., dict[str, Any]] = run_job) -> int:
-    """Makes the run that a folder describes, by a function as `run_job`; 0, or 1 on failure."""
+    """Makes the run that a folder describes, by a function as `run_job`: the other side of
+    `ProcessRunner`. Its record is left in the folder, or the reason why there is none; returns 0,
+    or 1 on failure."""
     from leco_plugin.chart.contender import Contender, Protocol
     from leco_plugin.evaluation.clock import seconds_now
     from leco_plugin.evaluation.report import describe_code
 
     die_with_parent()
     code, started = describe_code(), seconds_now()  # as this process has loaded it
+    shown = 0.0
 
-    def make(job: dict[str, Any], show: Callable[[float], None]) -> dict[str, Any]:
+    def show(share: float) -> None:
+        nonlocal shown
+        if share - shown >= 0.01:
+            shown = share
+            (folder / PROGRESS).write_text(f"{share:.3f}")
+
+    try:
+        job = json.loads((folder / JOB).read_text())
         contender, protocol = Contender.from_dict(job["contender"]), Protocol(**job["protocol"])
         found = run(contender, job["seed"], Path(job["data"]), protocol, folder, show)
         # the name that stored charts have; in one thread on a CPU they are the processor's
-        return {**found, "code": code, "wall_seconds": round(seconds_now() - started, 1)}
-
-    return work_on(folder, make)
+        seconds = round(seconds_now() - started, 1)
+        write_json(folder / RESULT, {**found, "code": code, "wall_seconds": seconds})
+    # whatever a method raises is a row of the table, and the others go on
+    except BaseException as error:  # noqa: BLE001
+        traceback.print_exc()
+        said = one_line(error)
+        reason = said if isinstance(error, ValueError) and said else None
+        write_json(folder / FAILURE, {"reason": reason or f"{type(error).__name__}: {said}"})
+        return 1
+    return 0
 
 
 if __name__ == "__main__":
