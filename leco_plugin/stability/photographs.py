@@ -18,7 +18,6 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.random import Generator
@@ -121,9 +120,6 @@ RADIUS = 5.0
 """Of the circle that cameras stand on, metres."""
 STRAY_RADIUS = 9.0
 """Of a camera that stands far off, metres."""
-SAME_PLACE = 0.05
-"""Share of the distance by which a surface in another picture may be off: pixels are wide at the
-size of these pictures."""
 DESCRIPTION, TRUTH = "stability.json", "truth"
 POINTS_PER_VIEW = 60
 
@@ -233,39 +229,14 @@ def _shift(pose: Array, by: Sequence[float] | Array) -> Array:
     return np.column_stack([pose[:, :3], pose[:, 3] + np.array(by)])
 
 
-class View(NamedTuple):
-    """A picture that was taken, and how far away what it shows is."""
-
-    pose: Array
-    """[3, 4] camera to world, metres, OpenGL axes."""
-    lens: Lens
-    depth: NDArray[np.floating]
-    """[h, w] metres along the rays; inf for no surface."""
-
-    def shows(self, points: Array) -> NDArray[np.bool_]:
-        """Which points [N, 3] lie in the picture and are hidden by nothing."""
-        seen = (points - self.pose[:, 3]) @ self.pose[:, :3]
-        ahead = -seen[:, 2]
-        shown = ahead > 0
-        ahead = np.where(shown, ahead, 1.0)
-        columns = np.floor(self.lens.focal * seen[:, 0] / ahead + self.lens.width / 2)
-        rows = np.floor(self.lens.height / 2 - self.lens.focal * seen[:, 1] / ahead)
-        shown &= (columns >= 0) & (columns < self.lens.width)
-        shown &= (rows >= 0) & (rows < self.lens.height)
-        depth = np.full(len(points), np.inf)
-        depth[shown] = self.depth[rows[shown].astype(int), columns[shown].astype(int)]
-        distance = np.linalg.norm(seen, axis=-1)
-        return shown & (np.abs(depth - distance) <= SAME_PLACE * distance)
-
-
-def count_views(view: View, others: Sequence[View]) -> NDArray[np.int32]:
+def count_views(seen: Seen, others: Sequence[Seen]) -> NDArray[np.int32]:
     """[h, w] how many of the other pictures show what a picture shows; 0 where it shows nothing.
 
     A surface in one picture alone has no depth that could be learned: whether it is kept is chance.
     """
-    counts = np.zeros(view.depth.shape, dtype=np.int32)
-    there = np.isfinite(view.depth)
-    points = view.lens.points(view.pose, view.depth)[there]
+    counts = np.zeros(seen.depth.shape, dtype=np.int32)
+    there = np.isfinite(seen.depth)
+    points = seen.lens.points(seen.pose, seen.depth)[there]
     for other in others:
         counts[there] += other.shows(points)
     return counts
@@ -302,35 +273,33 @@ def digest_of(stage: Stage, capture: Capture) -> str:
 
 def _take_pictures(stage: Stage, capture: Capture, folder: Path) -> None:
     """Writes pictures, truth, sparse points and transforms."""
-    taken: list[tuple[Shot, Seen, View]] = []
+    taken: list[tuple[Shot, Seen]] = []
     for number, shot in enumerate(shots_of(capture)):
         there = stage
         if shot.moving:  # a car, never twice in the same place
             x = -3.0 + (1.7 * number) % 6.0
             car = Box((x - 0.5, -0.35, 0.0), (x + 0.5, 0.25, 0.55), CAR)
             there = replace(stage, shapes=(*stage.shapes, car))
-        lens = capture.lens(shot.size)
-        seen = photograph(there, shot.pose, lens)
-        taken.append((shot, seen, View(shot.pose, lens, seen.depth)))
-    trained = [view for shot, _, view in taken if not shot.held_out]
+        taken.append((shot, photograph(there, shot.pose, capture.lens(shot.size))))
+    trained = [seen for shot, seen in taken if not shot.held_out]
     clouds, frames = [], []
-    for number, (shot, seen, view) in enumerate(taken):
+    for number, (shot, seen) in enumerate(taken):
         light = seen.image[..., :3].astype(float) * shot.gain
         image = np.dstack([np.rint(light.clip(0, 255)).astype(np.uint8), seen.image[..., 3]])
         Image.fromarray(image).save(folder / shot.file)
         if shot.held_out:
-            shown = count_views(view, trained)
+            shown = count_views(seen, trained)
             truth = {"depth": seen.depth, "detail": seen.detail, "shown_by": shown}
             np.savez(folder / TRUTH / f"{shot.name}.npz", **truth)
         random = np.random.default_rng([capture.seed, 23, number])
         clouds.append(
-            view.lens.some_points(shot.written, view.depth, seen.image, POINTS_PER_VIEW, random)
+            seen.lens.some_points(shot.written, seen.depth, seen.image, POINTS_PER_VIEW, random)
         )
-        frames.append(frame_of(shot.written, file_path=shot.file, **view.lens.intrinsics))
+        frames.append(frame_of(shot.written, file_path=shot.file, **seen.lens.intrinsics))
     facts = {"orientation_override": "none"}
     places, colours = map(np.concatenate, zip(*clouds))
     if len(places):
         write_points(folder / POINTS, places, colours)
         facts["ply_file_path"] = POINTS
-    held_out = [shot.file for shot, _, _ in taken if shot.held_out]
+    held_out = [shot.file for shot, _ in taken if shot.held_out]
     write_json(folder / TRANSFORMS, transforms_of(facts, frames, held_out), indent=1)

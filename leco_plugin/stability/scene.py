@@ -22,6 +22,9 @@ _TINY = 1e-9
 _SHADE = 0.45
 """Light where the sun does not reach."""
 _FOG_STEPS = 32
+SAME_PLACE = 0.05
+"""Share of the distance by which a surface in another picture may be off: pixels are wide at the
+size of these pictures."""
 _HORIZON, _ZENITH = np.array([0.86, 0.90, 0.94]), np.array([0.35, 0.55, 0.86])
 
 
@@ -159,12 +162,32 @@ class Stage:
 
 
 class Seen(NamedTuple):
+    """A picture that was taken, and how far away what it shows is."""
+
+    pose: Array
+    """[3, 4] camera to world, metres, OpenGL axes."""
+    lens: Lens
     image: NDArray[np.uint8]
     """[height, width, 4]."""
     depth: NDArray[np.float32]
     """[height, width] metres along the ray through the pixel's middle; inf for no surface."""
     detail: NDArray[np.bool_]
     """[height, width] pixels in which some of the details is seen."""
+
+    def shows(self, points: Array) -> NDArray[np.bool_]:
+        """Which points [N, 3] lie in the picture and are hidden by nothing."""
+        seen = (points - self.pose[:, 3]) @ self.pose[:, :3]
+        ahead = -seen[:, 2]
+        shown = ahead > 0
+        ahead = np.where(shown, ahead, 1.0)
+        columns = np.floor(self.lens.focal * seen[:, 0] / ahead + self.lens.width / 2)
+        rows = np.floor(self.lens.height / 2 - self.lens.focal * seen[:, 1] / ahead)
+        shown &= (columns >= 0) & (columns < self.lens.width)
+        shown &= (rows >= 0) & (rows < self.lens.height)
+        depth = np.full(len(points), np.inf)
+        depth[shown] = self.depth[rows[shown].astype(int), columns[shown].astype(int)]
+        distance = np.linalg.norm(seen, axis=-1)
+        return shown & (np.abs(depth - distance) <= SAME_PLACE * distance)
 
 
 def photograph(stage: Stage, camera_to_world: Array, lens: Lens) -> Seen:
@@ -180,7 +203,8 @@ def photograph(stage: Stage, camera_to_world: Array, lens: Lens) -> Seen:
     straight = np.concatenate([total[:, :3] / np.maximum(alpha, 1e-9), alpha], axis=-1)
     image = np.rint(255 * straight.clip(0, 1)).astype(np.uint8).reshape(*size, 4)
     depth = depths[0].astype(np.float32).reshape(size)
-    return Seen(image, depth, are_details.any(axis=0).reshape(size))
+    detail = are_details.any(axis=0).reshape(size)
+    return Seen(camera_to_world, lens, image, depth, detail)
 
 
 def look(stage: Stage, origins: Array, directions: Array) -> tuple[Array, Array, NDArray[np.bool_]]:

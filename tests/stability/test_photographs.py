@@ -22,13 +22,12 @@ from leco_plugin.stability.photographs import (
     YARD,
     Capture,
     Shot,
-    View,
     count_views,
     digest_of,
     shots_of,
     write_scene,
 )
-from leco_plugin.stability.scene import Array, Box, Paint, Stage, photograph
+from leco_plugin.stability.scene import Array, Box, Paint, Seen, Stage, photograph
 from leco_plugin.stability.worker import FEWEST_VIEWS
 
 PLAIN = Capture()
@@ -90,12 +89,12 @@ GREY = Paint((0.5, 0.5, 0.5))
 WALL = Box((-8.0, 0.0, -8.0), (8.0, 1.0, 8.0), GREY)
 
 
-def view(stage: Stage, position: tuple[float, float, float], target: tuple[float, ...]) -> View:
+def view(stage: Stage, position: tuple[float, float, float], target: tuple[float, ...]) -> Seen:
     pose: Array = look_at(np.array(position), np.array(target))
-    return View(pose, LENS, photograph(stage, pose, LENS).depth)
+    return photograph(stage, pose, LENS)
 
 
-def points_of(view: View) -> Array:
+def points_of(view: Seen) -> Array:
     """[h, w, 3] what a picture shows, metres."""
     return view.lens.points(view.pose, view.depth)
 
@@ -138,7 +137,7 @@ def test_what_the_held_out_pictures_of_a_case_show_can_be_learned() -> None:
     capture = Capture()
     shots = shots_of(capture)
     lens = capture.lens()
-    views = [View(shot.pose, lens, photograph(YARD, shot.pose, lens).depth) for shot in shots]
+    views = [photograph(YARD, shot.pose, lens) for shot in shots]
     trained = [one for shot, one in zip(shots, views) if not shot.held_out]
     counts = np.concatenate(
         [
