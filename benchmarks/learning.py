@@ -37,8 +37,10 @@ def report_of(history: GateHistory, scene: str, date: str) -> dict[str, Any]:
         "date": date,
         "machine": describe_machine(),
         "steps": history.steps,
-        "shares": [[round(float(x), 4) for x in row] for row in history.shares],
-        "densities": [[round(min(float(x), OPAQUE), 4) for x in row] for row in history.densities],
+        "shares": [[round(float(x), 4) for x in row] for row in history.all("shares")],
+        "densities": [
+            [round(min(float(x), OPAQUE), 4) for x in row] for row in history.all("densities")
+        ],
     }
 
 

@@ -17,11 +17,9 @@ def history() -> GateHistory:
     """Four looks; from the third on half, then three quarters, of the points are empty."""
     shares = [[0.0, 1.0, 0.0], [0.2, 0.8, 0.0], [0.5, 0.25, 0.25], [0.75, 0.0, 0.25]]
     densities = [[0.0, 1.0, 0.0], [1.0, 9.0, 0.0], [2.0, 100.0, 300.0], [4.0, 0.0, 1e13]]
-    looks = GateHistory([0, 10, 20, 30], [0.0, 1.0, 2.0, 3.0])
-    looks.shares, looks.densities = (
-        [torch.tensor(row) for row in rows] for rows in (shares, densities)
-    )
-    return looks
+    rows = {"steps": [0, 10, 20, 30], "shares": shares, "densities": densities}
+    tensors = {name: torch.tensor(values) for name, values in rows.items()}
+    return GateHistory([{name: tensors[name][look] for name in tensors} for look in range(4)])
 
 
 def test_the_sentence_is_of_the_later_looks_and_opaque_is_opaque() -> None:

@@ -134,7 +134,7 @@ def test_training_leaves_a_config_a_checkpoint_and_the_occupancy(trained: Path) 
     )
     assert history.steps[0] == 0 and len(history) >= 3
     for name, value in occupancy.gate.state_dict().items():
-        assert torch.equal(history.weights[-1][name], value)
+        assert torch.equal(history.weights(-1)[name], value)
 
 
 def test_resuming_goes_on_at_the_next_step(

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from PIL import Image
 
 from leco_plugin.chart.theme import LIGHT, new_figure, plain, save_whole
@@ -111,8 +110,8 @@ class _Film:
         middle = middle_of(surface_points(cells, low)[0], self.box)
         self.places = ((2, low + HORIZONTAL[0] * (high - low)), (1, float(middle[1])))
         """The axis that each slice is normal to, and its position along that, scene units."""
-        self.shares = torch.stack(history.shares).numpy()
-        self.densities = torch.stack(history.densities).clamp(max=OPAQUE).numpy()
+        self.shares = history.all("shares").numpy()
+        self.densities = history.all("densities").clamp(max=OPAQUE).numpy()
 
     def still(self, looks: list[int]) -> Any:
         """A figure with a column for each of some looks, over the lines of all."""
@@ -143,7 +142,7 @@ class _Film:
             yield figure
 
     def _draw_slices(self, above: Any, below: Any, look: int) -> None:
-        self.occupancy.gate.load_state_dict(self.history.weights[look])
+        self.occupancy.gate.load_state_dict(self.history.weights(look))
         for axes, (normal, at) in zip((above, below), self.places):
             draw_slice(axes, self.occupancy, self.box, normal, at, pixels=FRAME_PIXELS)
 

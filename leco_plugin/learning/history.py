@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 FILE_NAME = "occupancy_history.safetensors"
 FORMAT = "leco_plugin.history"
+GATE = "gate."
+"""Before names of the gate's state in a history."""
 PROBES = 16384
 """Positions at which the gate's decisions are compared between two checks."""
 
@@ -79,53 +81,52 @@ def as_learned(occupancy: Occupancy) -> Occupancy:
 class GateHistory:
     """Looks at a gate, one after the other."""
 
-    steps: list[int] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
-    """Seconds of learning until each look."""
-    shares: list[Tensor] = field(default_factory=list)
-    """[1 + n] share of the probe positions that each expert gets; 0 is the empty-space expert."""
-    densities: list[Tensor] = field(default_factory=list)
-    """[1 + n] mean density of those, per half extent of the scene; 0 where an expert gets none."""
-    weights: list[dict[str, Tensor]] = field(default_factory=list)
-    """State dicts of the gate."""
+    looks: list[dict[str, Tensor]] = field(default_factory=list)
+    """By names of the file: `steps`; `seconds` of learning until then; `shares` [1 + n] of the
+    probe positions that each expert gets, the empty-space expert first, and their mean `densities`
+    [1 + n], per half extent of the scene, 0 where an expert gets none; and the gate's state."""
 
     def __len__(self) -> int:
-        return len(self.steps)
+        return len(self.looks)
+
+    def all(self, name: str) -> Tensor:
+        """What all looks have under a name, [looks, ...]."""
+        return torch.stack([look[name] for look in self.looks])
+
+    @property
+    def steps(self) -> list[int]:
+        return [int(look["steps"]) for look in self.looks]
+
+    def weights(self, number: int) -> dict[str, Tensor]:
+        """The gate's state at a look."""
+        found = self.looks[number].items()
+        return {name.removeprefix(GATE): value for name, value in found if name.startswith(GATE)}
 
     def look(self, step: int, seconds: float, gate: Gate, routes: Tensor, sigmas: Tensor) -> None:
         """Remembers the gate after a step; routes and sigmas as of `routes_and_densities`."""
         shares, densities = expert_statistics(routes, sigmas, 1 + gate.config.scene_experts)
-        self.steps.append(step)
-        self.seconds.append(seconds)
-        self.shares.append(shares.cpu())
-        self.densities.append(densities.cpu())
-        state = gate.state_dict()
-        self.weights.append({name: value.detach().cpu().clone() for name, value in state.items()})
+        passed = torch.tensor(seconds, dtype=torch.float64)
+        seen = {"steps": torch.tensor(step), "seconds": passed}
+        seen |= {"shares": shares, "densities": densities}
+        seen |= {GATE + name: value for name, value in gate.state_dict().items()}
+        self.looks.append({name: value.detach().cpu().clone() for name, value in seen.items()})
 
     @classmethod
     def load_before(cls, checkpoint: Path, step: int, gate: Gate) -> GateHistory:
         """The looks of a run, given by a checkpoint or its folder of checkpoints, before the step
         at which it resumes; none if it stored none of this gate."""
         try:
-            found = cls.load(folder_of(checkpoint) / FILE_NAME, gate)
+            looks = cls.load(folder_of(checkpoint) / FILE_NAME, gate).looks
         except (OSError, ValueError):
             return cls()
-        looks = sum(look < step for look in found.steps)
-        return cls(*(getattr(found, each.name)[:looks] for each in fields(cls)))
+        return cls([look for look in looks if look["steps"] < step])
 
     def save(self, folder: Path) -> Path:
         """Writes `occupancy_history.safetensors` in a folder, whole or not at all; ValueError if
         there was no look yet."""
-        if not self.steps:
+        if not self.looks:
             raise ValueError("a history without a single look cannot be written")
-        tensors = {
-            "steps": torch.tensor(self.steps),
-            "seconds": torch.tensor(self.seconds, dtype=torch.float64),
-            "shares": torch.stack(self.shares),
-            "densities": torch.stack(self.densities),
-        }
-        for name in self.weights[0]:
-            tensors[f"gate.{name}"] = torch.stack([state[name] for state in self.weights])
+        tensors = {name: self.all(name) for name in self.looks[0]}
         path = folder / FILE_NAME
         write_whole(path, save(tensors, metadata={"format": FORMAT}))
         return path
@@ -152,15 +153,9 @@ class GateHistory:
         state, experts = gate.state_dict(), (1 + gate.config.scene_experts,)
         expected: dict[str, tuple[int, ...]] = {"steps": (), "seconds": ()}
         expected |= {"shares": experts, "densities": experts}
-        expected |= {f"gate.{name}": tuple(value.shape) for name, value in state.items()}
+        expected |= {GATE + name: tuple(value.shape) for name, value in state.items()}
         looks = len(tensors.get("steps", ()))
         shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
         if not looks or shapes != {name: (looks, *each) for name, each in expected.items()}:
             raise ValueError(f"{path} is the history of another gate than that of the occupancy")
-        return cls(
-            tensors["steps"].tolist(),
-            tensors["seconds"].tolist(),
-            list(tensors["shares"]),
-            list(tensors["densities"]),
-            [{name: tensors[f"gate.{name}"][look] for name in state} for look in range(looks)],
-        )
+        return cls([{name: tensors[name][look] for name in tensors} for look in range(looks)])

@@ -31,8 +31,8 @@ def a_history(gate: Gate, looks: int = 3) -> GateHistory:
 
 def test_shares_and_mean_densities_are_those_of_the_points_of_each_expert() -> None:
     history = a_history(a_gate(), 1)
-    assert history.shares[0].tolist() == [0.75, 0.0, 0.25]
-    assert history.densities[0].tolist() == [1.0, 0.0, 5.0]
+    assert history.all("shares")[0].tolist() == [0.75, 0.0, 0.25]
+    assert history.all("densities")[0].tolist() == [1.0, 0.0, 5.0]
 
 
 def test_the_gate_of_each_look_comes_back_from_the_file(tmp_path: Path) -> None:
@@ -40,8 +40,9 @@ def test_the_gate_of_each_look_comes_back_from_the_file(tmp_path: Path) -> None:
     before = gate.head.bias.detach().clone()
     a_history(gate).save(tmp_path)
     found = GateHistory.load(tmp_path / FILE_NAME, gate)
-    assert found.steps == [0, 10, 20] and found.seconds == [0.0, 1 / 3, 2 / 3]
-    for look, weights in enumerate(found.weights):
+    assert found.steps == [0, 10, 20] and found.all("seconds").tolist() == [0.0, 1 / 3, 2 / 3]
+    for look in range(3):
+        weights = found.weights(look)
         torch.testing.assert_close(weights["head.bias"], before + 1.0 + look)
     assert weights.keys() == gate.state_dict().keys()
     assert [path.name for path in tmp_path.iterdir()] == [FILE_NAME]
@@ -57,7 +58,7 @@ def test_a_resumed_run_goes_on_with_the_looks_before_its_first_step(tmp_path: Pa
     (tmp_path / "config.yml").touch()
     for checkpoint in (folder, folder / "step-000000015.ckpt", nested):
         found = GateHistory.load_before(checkpoint, 16, gate)
-        assert found.steps == [0, 10] and len(found.weights) == len(found.shares) == 2
+        assert found.steps == [0, 10] and len(found) == 2
         found.look(16, 1.0, gate, torch.tensor([0]), torch.tensor([0.0]))
         assert GateHistory.load(found.save(folder), gate).steps == [0, 10, 16]
     (tmp_path / "config.yml").unlink()
