@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,6 @@ def make_charts(
     seeds: Sequence[int],
     reuse: Sequence[Path],
     asked: Mapping[str, Any],
-    runner_for: Callable[[Chart], Runner] = processes,
 ) -> dict[Path, dict[str, Any]]:
     """Makes what is missing of one chart, or of those of several suites, and draws it.
 
@@ -43,7 +42,6 @@ def make_charts(
         suites: names of comparisons, or `all`; in place of methods and samplers.
         reuse: folders of other charts on this scene, whose runs need not be made again.
         asked: fields of `Protocol`; None where a suite may have its own.
-        runner_for: gives what makes the runs of a chart.
     Returns:
         The results by folder, as in `results.json`.
     Raises:
@@ -65,7 +63,7 @@ def make_charts(
         for chart in charts:
             others = [out / other for other in SUITES if other != chart.suite]
             chart.reuse = [other for other in others if not why_not_shared(other, chart.settings)]
-    return {chart.folder.path: _make(chart, runner_for) for chart in charts}
+    return {chart.folder.path: _make(chart) for chart in charts}
 
 
 def refuse_failures(made: Sequence[Mapping[str, Any]]) -> None:
@@ -120,11 +118,11 @@ def _chart_of(
     return Chart(data, out, compared, seeds, protocol, titled, command, reuse)
 
 
-def _make(chart: Chart, runner_for: Callable[[Chart], Runner]) -> dict[str, Any]:
+def _make(chart: Chart) -> dict[str, Any]:
     suite = f"{chart.suite}, " if chart.suite else ""
     title = f"{chart.scene['name']}, {suite}{chart.protocol.describe()} a run"
     with resumable(), bar(title) as show:
-        chart.make(runner_for(chart), put, show)
+        chart.make(processes(chart), put, show)
     return chart.draw()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import json
 import os
 from collections.abc import Callable
@@ -42,8 +41,7 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Started:
 
         return make
 
-    made = functools.partial(command.make_charts, runner_for=runner_for)
-    monkeypatch.setattr(command, "make_charts", made)
+    monkeypatch.setattr(command, "processes", runner_for)
     return runs
 
 
