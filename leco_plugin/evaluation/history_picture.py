@@ -46,7 +46,7 @@ def draw_history(occupancy: Occupancy, folder: Path, path: Path) -> Path:
     other pictures show the first look, two between, and the last.
 
     Raises:
-        InputError: the run has no history, or one of another gate.
+        ValueError: the run has no history, or one of another gate.
         OSError, ValueError: the picture cannot be written there, or is of no known kind.
     """
     film = _Film(occupancy, read_history(occupancy, folder))
@@ -94,8 +94,6 @@ def read_history(occupancy: Occupancy, folder: Path) -> GateHistory:
             f"there is no {file}: a run of leco-occupancy leaves one with "
             "--pipeline.model.schedule.steps-per-record 10"
         ) from None
-    except ValueError as error:
-        raise InputError(str(error)) from None
 
 
 class _Film:
