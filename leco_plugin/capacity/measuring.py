@@ -153,8 +153,8 @@ def measure_candidate(taught: Taught, candidate: Candidate, lost: float) -> dict
     else:
         score = taught_score(candidate.gate, taught.lesson, taught.mixture.precision)
     rows = [
-        measure(taught.held_out, *scores, lost) | facts
-        for *scores, facts in ground.scores_of(score, lost)
+        measure(taught.held_out, of_rays, of_volume, lost) | facts
+        for of_rays, of_volume, facts in ground.scores_of(score, lost)
     ]
     found = min(rows, key=lambda one: one["kept_volume"])  # a grid may keep less dilated
     seconds = round(seconds_now() - started, 2)
