@@ -233,23 +233,19 @@ CONE_ANGLE = 0.02
 
 @checks("skips-only-what-it-may", "estimator")
 def skips_only_what_it_may(case: EstimatorCase) -> None:
-    for training in (False, True):
-        for scene, step, rays in (
-            (SLAB, kit.STEP, kit.crossing()),
-            (SLAB, kit.STEP, kit.stretched()),
-            (SLAB, kit.STEP, kit.within()),
-            (kit.TWO, kit.LONG_STEP, kit.crossing(kit.MANY)),
-        ):
-            sampler = case.shared(scene).train(training)
-            samples = case.sample(sampler, rays, render_step_size=step)
-            if case.needs_occupancy:
-                _check_skipped_is_not(rays, samples, scene)
-            _check_kept_is_sampled(rays, samples, scene, step, training)
-        if case.needs_occupancy:  # the host's box is not where an unbounded scene ends
-            rays, sampler = kit.leaving(), case.shared(kit.AROUND).train(training)
-            samples = case.sample(sampler, rays)
-            _check_skipped_is_not(rays, samples, kit.AROUND)
-            _check_kept_is_sampled(rays, samples, kit.AROUND, shifted=training)
+    scenes = [
+        (SLAB, kit.STEP, kit.crossing()),
+        (SLAB, kit.STEP, kit.stretched()),
+        (SLAB, kit.STEP, kit.within()),
+        (kit.TWO, kit.LONG_STEP, kit.crossing(kit.MANY)),
+    ]
+    if case.needs_occupancy:  # the host's box is not where an unbounded scene ends
+        scenes.append((kit.AROUND, kit.STEP, kit.leaving()))
+    for training, (scene, step, rays) in itertools.product((False, True), scenes):
+        samples = case.sample(case.shared(scene).train(training), rays, render_step_size=step)
+        if case.needs_occupancy:
+            _check_skipped_is_not(rays, samples, scene)
+        _check_kept_is_sampled(rays, samples, scene, step, training)
 
 
 def _check_skipped_is_not(rays: Rays, samples: Samples, scene: Slab) -> None:
