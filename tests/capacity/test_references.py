@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 import torch
 from ball_occupancy import ball
 
+from leco_plugin.capacity import shrink
 from leco_plugin.capacity.evidence import Evidence, loss, unlikely_at
 from leco_plugin.capacity.references import (
     HOLDS,
@@ -26,6 +28,7 @@ from leco_plugin.capacity.references import (
 from leco_plugin.capacity.search import MARGIN, kept_of_box, lower_threshold
 from leco_plugin.capacity.sources import Source, draw_held_out
 from leco_plugin.learning.calibration import THRESHOLDS
+from leco_plugin.learning.freezing import HARDLY_ANYTHING
 from leco_plugin.occupancy import Occupancy
 
 
@@ -100,18 +103,51 @@ def test_the_threshold_is_the_largest_within_the_bound(part: float) -> None:
     assert kept_of_box(lower) > kept_of_box(here.original) > 0.0
 
 
-def test_one_that_meets_it_is_shrunk_as_it_is() -> None:
+def test_an_original_stays_as_it_is_where_it_holds_nothing_measures_it_or_no_threshold_does() -> (
+    None
+):
     here = ground(True, False)
     lost = lost_at(here.original, here.references[1].search.evidence, here.original.threshold)
     assert lower_threshold(here, Bounds(1.01 * lost / MARGIN)) is None
-
-
-def test_where_nothing_measures_the_original_it_stays_as_it_is() -> None:
     assert lower_threshold(ground(True), Bounds(1e-9)) is None
+    assert lower_threshold(here, Bounds(1e-9)) is None
 
 
-def test_where_no_threshold_meets_it_there_is_none() -> None:
-    assert lower_threshold(ground(True, False), Bounds(1e-9)) is None
+@pytest.mark.parametrize("skipped", [0.06, 0.04])
+def test_smaller_gates_follow_the_lowered_original_if_it_skips_enough(
+    skipped: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here, drawn, asked = on_its_boundary(), ("sides", "taught"), list[float]()
+    guided, absolute = here.references
+    searched, count = guided.search.evidence, len(guided.search.evidence.kept)
+
+    def prepare(source: object, original: Occupancy, *given: object) -> Ground:
+        assert given == drawn
+        asked.append(original.threshold)
+        share = 0.5 if original is here.original else skipped
+        kept = torch.arange(count) >= share * count
+        now = guided._replace(search=Part(searched._replace(kept=kept)))
+        return here._replace(original=original, references=[now, absolute])
+
+    monkeypatch.setattr(shrink, "draw_rays", lambda *_: drawn)
+    monkeypatch.setattr(shrink, "prepare", prepare)
+    unsure = absolute.search.evidence
+    bounds = Bounds(0.5 * lost_at(here.original, unsure, here.original.threshold) / MARGIN)
+    known = lower_threshold(here, bounds)
+    assert known is not None
+    given = Source(None, None), here.original, Path("it"), bounds
+    if skipped < HARDLY_ANYTHING:
+        with pytest.raises(ValueError, match=r"it is within .* skips 4\.0% of all candidates"):
+            shrink._meet_bounds(*given)
+    else:
+        found, itself, lowered = shrink._meet_bounds(*given)
+        assert found.original.threshold == known.threshold
+        ratio = kept_of_box(known) / kept_of_box(here.original)
+        expected = {"from": here.original.threshold, "to": known.threshold, "kept_volume": ratio}
+        assert lowered == pytest.approx(expected, abs=1e-4) and ratio > 1.01
+        lost = lost_at(known, unsure, known.threshold)
+        assert itself.lost_surface_mass == pytest.approx(lost) and lost > 1e-3
+    assert asked == [here.original.threshold, known.threshold]
 
 
 def test_an_original_that_guides_its_reference_loses_what_it_declares() -> None:
@@ -170,14 +206,36 @@ def test_a_declared_gain_is_no_licence_to_lose_it_again() -> None:
     assert [declared(made, name) for name in "abcde"] == [0.25, 0.0, 0.0, 1.0, 0.0]
 
 
-def test_its_image_price_is_the_worst_that_any_reference_measures() -> None:
-    here = ground(True)
-    seen = here.references[0]
-    part = Part(seen.search.evidence, [object()])  # rendered: the original guides, so none is asked
+def test_its_image_price_is_the_worst_that_any_reference_measures_on_either_side(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What is rendered stands for what another gate costs there."""
+    monkeypatch.setattr(
+        "leco_plugin.capacity.references.image_price", lambda _, costs, __: costs[0]
+    )
+    seen = ground(True).references[0]
+    rendering = seen._replace(mixture=object())
     known = [
-        seen._replace(mixture=object(), price_before=price, search=part)
-        for price in (0.01, 0.05, 0.03)
+        rendering._replace(
+            price_before=before,
+            search=Part(seen.search.evidence, [on_search]),
+            verify=Part(seen.verify.evidence, [on_verify]),
+        )
+        for before, on_search, on_verify in ((0.01, 0.07, 0.02), (0.05, 0.0, 0.01))
     ]
-    several = here._replace(references=known)
-    assert several.price(several.original, "search") == 0.05
-    assert several._replace(references=[]).price(several.original, "search") is None
+    here = ground(True)._replace(references=[*known, rendering._replace(price_before=9.0), seen])
+    other = here.original.with_threshold(0.4)
+    assert [here.price(other, side) for side in ("search", "verify")] == pytest.approx([0.08, 0.06])
+    assert here.price(here.original, "search") == 0.05  # the original guides, so none is asked
+    rung = measure_original(here, Bounds(0.9, 0.05))
+    assert rung.verdict == HOLDS and rung.image_price_db == 0.05
+    for references in (
+        known,
+        [one._replace(search=one.verify, verify=one.search) for one in known],
+    ):
+        sides = here._replace(references=references)
+        assert verify(sides, other, Bounds(0.9, 0.081), rung, 1)
+        assert rung.verified["image_price_db"] == pytest.approx(0.08)
+        assert not verify(sides, other, Bounds(0.9, 0.079), rung, 1)
+    assert here._replace(references=[]).price(here.original, "search") is None
+    assert here._replace(references=[seen]).price(other, "search") is None

@@ -23,6 +23,7 @@ from leco_plugin.capacity.evidence import Evidence, gather, loss, unlikely_at
 from leco_plugin.capacity.shrink import compare_queries
 from leco_plugin.evaluation.inspection import describe
 from leco_plugin.evaluation.report import describe_code
+from leco_plugin.learning.calibration import THRESHOLDS
 from leco_plugin.learning.freezing import leave_field
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.figures import prices
@@ -318,28 +319,54 @@ def test_what_is_declared_holds_against_the_field_at_the_moment_of_freezing(
         assert part.evidence.rays == references.RAYS > sum(len(one.truth) for one in part.rendered)
 
 
-@pytest.mark.parametrize("lower", [0.2, None])
-def test_the_kept_volume_is_of_the_file_that_was_shrunk_whatever_its_threshold_became(
-    lower: float | None, ball: Path
+def test_an_original_that_loses_too_much_is_shrunk_at_the_threshold_that_it_was_lowered_to(
+    hazy: Path, monkeypatch: pytest.MonkeyPatch, shrunk: Shrinks
 ) -> None:
-    given = Occupancy.load(ball)
-    original = given if lower is None else given.with_threshold(lower)
-    smaller = original.with_threshold(0.05)
-    of_given, of_original, of_smaller = map(search.kept_of_box, (given, original, smaller))
-    lowered = {"from": given.threshold, "to": original.threshold}
-    lowered["kept_volume"] = of_original / of_given
-    rung = references.Rung("", 1, 2, of_smaller / of_original, 0.0, None, "chosen", 0.0)
-    rung.verified = {"kept_candidates_dropped": 0.0, "lost_surface_mass_bound": 0.0}
-    rung.verified |= dict.fromkeys(("lost_mass", "image_price_db", "empty_fraction"), 0.0)
-    nothing = torch.zeros(0)
-    part = references.Part(Evidence(nothing, nothing, nothing, nothing, nothing, rays=3))
-    known = references.Reference(references.NOW, None, 0.0, 0.0, 0.0, part, part)
-    here = references.Ground(original, part.evidence, [known])
-    said = None if lower is None else lowered
-    report = shrink._report_of(here, smaller, rung, False, said, None)
-    kept = report["kept_volume_of_the_original"]
-    assert kept == pytest.approx(of_smaller / of_given, abs=1e-4) and kept > 1.01
-    assert report["threshold"] == pytest.approx(0.05) and report["calibration_rays"] == 3
+    """The field at freezing has matter down to an o(x) of 0.2, and the file keeps it from 0.99 on.
+
+    Both thresholds, and what is kept and lost, are found again by their definitions.
+    """
+    given = Occupancy.load(hazy).with_threshold(0.99)
+    given.save(hazy)
+    real, prepare, grounds = references.gather, shrink.prepare, list[references.Ground]()
+
+    def known(mixture: Any, occupancy: Occupancy | None, seen: Any) -> Any:
+        evidence, rendered = real(mixture, occupancy, seen)
+        if occupancy is None:  # the field at freezing
+            matter = (given.query(evidence.positions) >= 0.2).float()
+            evidence = evidence._replace(weights=matter, worth=matter)
+        return evidence, rendered
+
+    def noted(source: Any, original: Occupancy, *drawn: Any) -> references.Ground:
+        grounds.append(prepare(source, original, *drawn))
+        return grounds[-1]
+
+    monkeypatch.setattr(references, "gather", known)
+    monkeypatch.setattr(shrink, "prepare", noted)
+    monkeypatch.setattr(references, "RAYS", 800)
+    monkeypatch.setattr(shrink, "RAYS", 256)
+    monkeypatch.setattr(search, "LONGER", 1)
+    bound = 0.3
+    options = ("--lost-surface-mass", bound, "--image-price", 50)
+    results, smaller, _, said = shrunk(hazy, [DEEPER], *options)
+    searched = grounds[0].references[1].search.evidence
+    lost = {t: lost_of(searched, given.with_threshold(t)) for t in (0.99, *THRESHOLDS)}
+    to = max(t for t, share in lost.items() if share <= search.MARGIN * bound)
+    assert lost[0.99] > search.MARGIN * bound
+    lower, lowered = given.with_threshold(to), results["lowered"]
+    assert f"lowered from 0.99 to {to:.3g}" in said
+    of_given, of_lower, of_smaller = map(search.kept_of_box, (given, lower, smaller))
+    assert lowered == pytest.approx(
+        {"from": 0.99, "to": to, "kept_volume": of_lower / of_given}, abs=1e-4
+    )
+    assert results["original"]["lost_surface_mass"] == pytest.approx(lost[to], rel=1e-3)
+    rung = results["rungs"][-1]
+    assert rung["verdict"] == "chosen"
+    assert rung["kept_volume"] == pytest.approx(of_smaller / of_lower, abs=1e-3)
+    kept = smaller.report["kept_volume_of_the_original"]
+    assert kept == pytest.approx(of_smaller / of_given, abs=1e-3) and kept > 1.02
+    unseen = lost_of(grounds[1].references[1].verify.evidence, smaller)
+    assert unseen <= smaller.report["verified_lost_surface_mass"] <= bound
 
 
 def test_an_empty_field_is_no_reference(known: tuple[sources.Source, Occupancy]) -> None:
