@@ -15,11 +15,13 @@ from conformance.estimator_mutants import Answers, rank
 from conformance.proposal_mutants import SoundProposal
 from conformance.shading_mutants import (
     AsksThereToo,
+    FillsUp,
+    SamplesElsewhere,
     ShadesElsewhere,
     ShadesEverySecond,
     ShadesItsBoxOnly,
 )
-from nerfstudio.cameras.rays import RayBundle, RaySamples
+from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import (
     DataManagerConfig,
     VanillaDataManagerConfig,
@@ -129,6 +131,13 @@ class HandsOutNothing(NGPModel):
         return {}
 
 
+class HandsOutItsDummy(NGPModel):
+    """Has in its optimizer only what nerfstudio gives to models without parameters."""
+
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        return {"fields": [self.device_indicator_param]}
+
+
 class Thaws(NerfactoModel):
     """Has everything trained that it holds."""
 
@@ -149,26 +158,8 @@ class GuidedTwice(NGPModel):
     """Comes with an adapter that has the gate in the checkpoint twice."""
 
 
-class FillsUp(NGPModel):
-    """Shades a whole ray in each batch, lest the field forget what free space is."""
-
-    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
-        edges = torch.linspace(0.1, 6.0, 20)[None, :, None]
-        whole: RaySamples = ray_bundle[:1].get_ray_samples(edges[:, :-1], edges[:, 1:])
-        self.field(whole)
-        return super().get_outputs(ray_bundle)
-
-
 class AsksAsItIs(NGPModel):
     """Comes with an adapter that asks the gate in the host's coordinates, whatever its own are."""
-
-
-class SamplesElsewhere(NGPModel):
-    """Has the sampler look at a scene that was moved."""
-
-    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
-        ray_bundle.origins = ray_bundle.origins - torch.tensor([0.5, -1.0, 2.0])
-        return super().get_outputs(ray_bundle)
 
 
 class DividesByOpacity(NGPModel):
@@ -188,6 +179,14 @@ class EverySecond(Answers):
 
     def change(self, ray_indices: Tensor, t_starts: Tensor, t_ends: Tensor) -> Samples:
         return ray_indices[::2], t_starts[::2], t_ends[::2]
+
+
+class ThinsOneRay(Answers):
+    """Leaves out one sample in eight of the first ray."""
+
+    def change(self, ray_indices: Tensor, t_starts: Tensor, t_ends: Tensor) -> Samples:
+        kept = (ray_indices > 0) | (torch.arange(len(ray_indices)) % 8 > 0)
+        return ray_indices[kept], t_starts[kept], t_ends[kept]
 
 
 class NearHalf(SoundProposal):
@@ -274,6 +273,7 @@ HOST_MUTANTS: dict[str, dict[str, GuidedModelConfig]] = {
     "teaches-the-host-alone": {
         "LearnsNothing": packed(LearnsNothing),
         "HandsOutNothing": packed(HandsOutNothing),
+        "HandsOutItsDummy": packed(HandsOutItsDummy),
         "Thaws": proposal(Thaws),
     },
     "nothing-superfluous-is-left": {
@@ -301,6 +301,7 @@ HOST_MUTANTS: dict[str, dict[str, GuidedModelConfig]] = {
     },
     "guided-by-everything-is-dense": {
         "EverySecondHost": packed(sampler="EverySecond"),
+        "ThinsOneRayHost": packed(sampler="ThinsOneRay"),
         "NearHalfHost": proposal(sampler="NearHalf"),
     },
     "held-out-images-teach-nothing": {"PeeksAtHeldOut": proposal(PeeksAtHeldOut)},
@@ -315,6 +316,7 @@ METHODS = {
 }
 SAMPLERS = {
     "EverySecond": SamplerSpec("", estimator=EverySecond, needs_occupancy=True),
+    "ThinsOneRay": SamplerSpec("", estimator=ThinsOneRay, needs_occupancy=True),
     "NearHalf": SamplerSpec("", proposal=NearHalf, needs_occupancy=True),
 }
 

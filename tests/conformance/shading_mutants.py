@@ -1,4 +1,4 @@
-"""Packed hosts that shade other samples in evaluation than those that are kept."""
+"""Packed hosts that shade other samples than those that are kept, most of them in evaluation."""
 
 from __future__ import annotations
 
@@ -68,3 +68,21 @@ class AsksThereToo(ShadesElsewhere):
         super().chosen(behind)
         self.field(behind)
         return every
+
+
+class FillsUp(NGPModel):
+    """Shades a whole ray in each batch, lest the field forget what free space is."""
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
+        edges = torch.linspace(0.1, 6.0, 20)[None, :, None]
+        whole: RaySamples = ray_bundle[:1].get_ray_samples(edges[:, :-1], edges[:, 1:])
+        self.field(whole)
+        return super().get_outputs(ray_bundle)
+
+
+class SamplesElsewhere(NGPModel):
+    """Has the sampler look at a scene that was moved."""
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
+        ray_bundle.origins = ray_bundle.origins - torch.tensor([0.5, -1.0, 2.0])
+        return super().get_outputs(ray_bundle)

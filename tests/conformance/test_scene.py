@@ -9,6 +9,7 @@ import torch
 
 from leco_plugin.conformance import scene
 from leco_plugin.conformance.proposals import chords
+from leco_plugin.conformance.rules import Broken
 from leco_plugin.models.encodings import Kind
 from leco_plugin.occupancy import Occupancy
 
@@ -77,3 +78,36 @@ def test_a_chord_ends_where_the_slab_does_to_a_hundredth():
 
     assert (depth(enters) >= 0.0).all() and (depth(leaves) >= 0.0).all()
     assert (depth(enters - 0.0101) < 0.0).all() and (depth(leaves + 0.0101) < 0.0).all()
+
+
+@pytest.mark.parametrize(
+    ("edges", "problem"),
+    [
+        ([(1.0, 1.1), (1.5, 1.6), (1.94, 2.04)], None),  # its middle is before the far end
+        ([(1.0, 1.1), (1.94, 2.08)], "middle beyond"),
+        ([(1.0, 1.1), (2.04, 2.1)], "middle beyond"),
+        ([(0.98, 1.1), (1.5, 1.6)], "begins before"),
+        ([(0.9, 1.08)], "begins before"),
+        ([(1.2, 1.1)], "does not end"),
+        ([(1.1, 1.1)], "does not end"),
+        ([(1.0, 1.2), (1.19, 1.3)], "overlaps"),
+        ([(1.3, 1.4), (1.0, 1.1)], "overlaps"),
+        ([], "no samples"),
+    ],
+)
+@pytest.mark.parametrize("ray", [0, 1])
+def test_samples_follow_one_another_between_the_ends_of_their_own_ray(ray, edges, problem):
+    """The other ray goes from 3 to 9, and has one sample if this one has any."""
+    near, far = torch.tensor([1.0, 3.0]), torch.tensor([2.0, 9.0])
+    if ray == 1:
+        near, far = near.flip(0), far.flip(0)
+    nowhere = torch.zeros(2, 3)
+    rays = scene.Rays(nowhere, nowhere, near, far)
+    found = [(ray, *edge) for edge in edges] + [(1 - ray, 5.0, 6.0)] * bool(edges)
+    numbers, *places = torch.tensor(sorted(found, key=lambda one: one[0])).view(-1, 3).T
+    samples = numbers.long(), *places
+    if problem is None:
+        scene.check_intervals(rays, samples)
+    else:
+        with pytest.raises(Broken, match=problem):
+            scene.check_intervals(rays, samples)
