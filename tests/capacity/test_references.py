@@ -103,6 +103,23 @@ def test_the_threshold_is_the_largest_within_the_bound(part: float) -> None:
     assert kept_of_box(lower) > kept_of_box(here.original) > 0.0
 
 
+def test_the_threshold_is_lowered_until_its_image_price_is_within_the_bound_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Which here is a tenth of the threshold in dB."""
+    price = "leco_plugin.capacity.references.image_price"
+    monkeypatch.setattr(price, lambda mixture, rendered, gate: 0.1 * gate.threshold)
+    here = ground(True, False)
+    guided, absolute = here.references
+    searched = Part(absolute.search.evidence, [object()])
+    here = here._replace(references=[guided, absolute._replace(mixture=object(), search=searched)])
+    lower = lower_threshold(here, Bounds(0.9, 0.02))
+    assert lower is not None
+    within = [threshold for threshold in THRESHOLDS if 0.1 * threshold <= 0.02]
+    assert lower.threshold == pytest.approx(max(within))
+    assert lower_threshold(here, Bounds(0.9, 0.0501)) is None
+
+
 def test_an_original_stays_as_it_is_where_it_holds_nothing_measures_it_or_no_threshold_does() -> (
     None
 ):

@@ -1,14 +1,16 @@
-"""Claims about what the file of a shrunk gate declares."""
+"""Claims about what the file of a shrunk gate holds and declares."""
 
 from __future__ import annotations
 
+import copy
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 from ball_occupancy import ball_of_the_tiny_scene
 
-from leco_plugin.capacity import references, search, shrink
+from leco_plugin.capacity import references, search, shrink, sources
 from leco_plugin.capacity.evidence import Evidence
 from leco_plugin.occupancy import Occupancy
 
@@ -93,3 +95,60 @@ def test_every_figure_is_declared_by_its_name_and_held_out_where_both_were(
         assert tested["lost_surface_mass"] == max(lost, 2e-4)
         assert tested["verified_lost_surface_mass"] == 2e-4
         assert tested["lost_on_test_photographs"] == lost
+
+
+@pytest.mark.parametrize("model", [None, object()])
+def test_photographs_that_decided_nothing_say_the_worst_of_all_references(
+    model: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shares, seen = {"one": 0.1, "another": 0.3, "a third": 0.2}, [SimpleNamespace(truth=[0] * 7)]
+    monkeypatch.setattr(sources, "draw_test_rays", lambda *given: seen[0])
+    monkeypatch.setattr(references, "measure_shares_lost", lambda *given: shares)
+    given: Any = sources.Source(None, model), None, None
+    worst = {"lost_surface_mass": None if model is None else 0.3}
+    worst |= {"lost_decisions": 0.3} if model is None else {}
+    assert shrink._check_on_test_photographs(*given) == {"rays": 7, **worst, "against": shares}
+    shares.clear()
+    assert shrink._check_on_test_photographs(*given) is None
+    seen[0] = None
+    assert shrink._check_on_test_photographs(*given) is None
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+@pytest.mark.parametrize(
+    ("verdict", "looks", "look"),
+    [
+        ("holds", [], 1),
+        ("holds", [None, 2, 4, None], 5),
+        ("is not within the bounds", None, 1),  # and nothing smaller is looked for
+        ("holds", [3], None),  # nothing measures it
+    ],
+)
+def test_an_original_that_is_stored_again_is_verified_by_one_look_more(
+    verdict: str,
+    looks: list[int | None] | None,
+    look: int | None,
+    precision: Any,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    original = copy.deepcopy(ball_of_the_tiny_scene())
+    original.precision = precision
+    before = copy.deepcopy(original.gate.state_dict())
+    itself = references.Rung("", 1, 2, 1.0, 0.0, None, verdict, 0.0)
+
+    def searched(*given: Any, **more: Any) -> search.Found:
+        assert looks is not None
+        return search.Found(None, [SimpleNamespace(look=one) for one in looks])  # type: ignore[misc]
+
+    asked: list[Any] = []
+    monkeypatch.setattr(shrink, "search", searched)
+    monkeypatch.setattr(references, "verify", lambda *given: asked.append(given[1:]))
+    ground: Any = SimpleNamespace(original=original, measures_original=look is not None)
+    bounds = references.Bounds()
+    found = shrink._find_smaller(ground, bounds, itself, lambda rung: None)
+    assert found == (original, itself)
+    assert asked == ([] if look is None else [(original, bounds, itself, look)])
+    for name, now in original.gate.state_dict().items():
+        is_rounded = precision == "bfloat16" and name.startswith("hidden.")
+        was = before[name].bfloat16().float() if is_rounded else before[name]
+        assert torch.equal(now, was), name

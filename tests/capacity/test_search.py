@@ -147,13 +147,22 @@ def test_a_loss_that_the_search_has_seen_is_declared_too() -> None:
 
 
 def test_nothing_is_lost_beyond_what_the_original_leaves() -> None:
-    with pytest.raises(ValueError, match="raise --lost-surface-mass"):
-        check_losses(NOBODY, original(lost_surface_mass=3e-3), FILE, Bounds(1e-3))
-    with pytest.raises(ValueError, match="raise --image-price"):
-        check_losses(NOBODY, original(image_price_db=0.06), FILE, Bounds())
+    """Each loss is held to its own bound, on which nothing is left."""
+    for name, bound, said in (
+        (
+            "lost_surface_mass",
+            1e-3,
+            "mass of 1.00e-03, which leaves nothing of 0.001: raise --lost",
+        ),
+        ("lost_decisions", 1e-3, "1.00e-03 of the decisions, which leaves nothing of 0.001: raise"),
+        ("image_price_db", 0.05, "of 0.050 dB, which leaves nothing of 0.05: raise --image-price"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            check_losses(NOBODY, original(**{name: bound}), FILE, Bounds())
+        check_losses(NOBODY, original(**{name: 0.99 * bound}), FILE, Bounds())
     with pytest.raises(ValueError, match="surface mass of nan, which leaves nothing"):
         check_losses(NOBODY, original(lost_surface_mass=float("nan")), FILE, Bounds())
-    check_losses(NOBODY, original(lost_surface_mass=4e-4, image_price_db=-0.1), FILE, Bounds())
+    check_losses(NOBODY, original(image_price_db=-0.1), FILE, Bounds())
 
 
 def test_what_the_original_has_lost_is_declared_too() -> None:

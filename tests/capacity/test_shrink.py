@@ -314,7 +314,14 @@ def test_what_is_declared_holds_against_the_field_at_the_moment_of_freezing(
     assert max(lost) <= verified == max(x["bound"] for x in against)
     assert verified <= smaller.report["lost_surface_mass"]
     source, original = sources.find_source(hazy, tiny_scene), Occupancy.load(hazy)
-    ground = shrink.prepare(source, original, *shrink.draw_rays(source, original))
+    sides, taught = shrink.draw_rays(source, original)
+    ground = shrink.prepare(source, original, sides, taught)
+    now, before = (
+        gather(source.mixture, original, taught)[0],
+        gather(source.frozen, None, taught)[0],
+    )
+    assert torch.equal(ground.taught.weights, torch.maximum(now.weights, before.weights))
+    assert bool((before.weights > now.weights).any()) and torch.equal(ground.taught.kept, now.kept)
     for part in (ground.references[1].search, ground.references[1].verify):
         assert part.evidence.rays == references.RAYS > sum(len(one.truth) for one in part.rendered)
 
