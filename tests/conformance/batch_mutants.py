@@ -195,6 +195,19 @@ class StandInWhereNothingIsKept(Sound):
         return torch.zeros(1, dtype=torch.int64), rays_o.new_zeros(1), rays_o.new_ones(1)
 
 
+class KeepsAllWithoutLimits(Sound):
+    """Skips nothing where rays have no limits of their own, as those of Instant-NGP."""
+
+    unlimited = False
+
+    def sampling(self, rays_o: Tensor, rays_d: Tensor, *args: Any, **options: Any) -> Samples:
+        self.unlimited = options["t_min"] is None
+        return super().sampling(rays_o, rays_d, *args, **options)
+
+    def occupied(self, positions: Tensor) -> Tensor:
+        return super().occupied(positions) | self.unlimited
+
+
 class ShakenUnasked(Sound):
     """Shifts rays in training, though a host wants them where they are."""
 
@@ -220,6 +233,7 @@ MUTANTS: dict[str, tuple[type, ...]] = {
         ReversedOnce,
         WithoutNearPlaneInTraining,
         WithoutFarPlaneInTraining,
+        KeepsAllWithoutLimits,
     ),
     "packing-consistent": (OffsetForgotten,),
     "deterministic-in-eval": (SetsTheSeed,),

@@ -11,15 +11,18 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
-from conformance.estimator_mutants import Answers, rank
-from conformance.proposal_mutants import SoundProposal
+from conformance.estimator_mutants import rank
 from conformance.shading_mutants import (
+    AsksAsItIs,
     AsksThereToo,
+    DropsOneRay,
     FillsUp,
+    NearHalf,
     SamplesElsewhere,
     ShadesElsewhere,
     ShadesEverySecond,
     ShadesItsBoxOnly,
+    ThinsOneRay,
 )
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.datamanagers.base_datamanager import (
@@ -124,13 +127,6 @@ class LearnsNothing(NGPModel):
         return {name: 0.0 * loss for name, loss in super().get_loss_dict(*args, **options).items()}
 
 
-class HandsOutNothing(NGPModel):
-    """Has its field in no optimizer."""
-
-    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
-        return {}
-
-
 class HandsOutItsDummy(NGPModel):
     """Has in its optimizer only what nerfstudio gives to models without parameters."""
 
@@ -158,10 +154,6 @@ class GuidedTwice(NGPModel):
     """Comes with an adapter that has the gate in the checkpoint twice."""
 
 
-class AsksAsItIs(NGPModel):
-    """Comes with an adapter that asks the gate in the host's coordinates, whatever its own are."""
-
-
 class DividesByOpacity(NGPModel):
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
         outputs = super().get_outputs(ray_bundle)
@@ -172,29 +164,6 @@ class ForgetsBackground(NGPModel):
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
         outputs = super().get_outputs(ray_bundle)
         return outputs | {"rgb": outputs["rgb"] * (outputs["accumulation"] > 0.0)}
-
-
-class EverySecond(Answers):
-    """Takes what lies between two samples for sampled."""
-
-    def change(self, ray_indices: Tensor, t_starts: Tensor, t_ends: Tensor) -> Samples:
-        return ray_indices[::2], t_starts[::2], t_ends[::2]
-
-
-class ThinsOneRay(Answers):
-    """Leaves out one sample in eight of the first ray."""
-
-    def change(self, ray_indices: Tensor, t_starts: Tensor, t_ends: Tensor) -> Samples:
-        kept = (ray_indices > 0) | (torch.arange(len(ray_indices)) % 8 > 0)
-        return ray_indices[kept], t_starts[kept], t_ends[kept]
-
-
-class NearHalf(SoundProposal):
-    """Draws from the nearer half of the places that are worth something."""
-
-    def worth(self, positions: Tensor) -> Tensor:
-        worth = super().worth(positions)
-        return worth * (worth.cumsum(dim=-2) <= 0.5 * worth.sum(dim=-2, keepdim=True))
 
 
 class Measures(NGPModel):
@@ -225,6 +194,15 @@ class CountsSteps(NerfactoModel):
         self.steps += 1
         losses = super().get_loss_dict(*args, **options)
         return {name: self.steps * loss for name, loss in losses.items()}
+
+
+class AddsItsSteps(CountsSteps):
+    """Tells a loss that grows by such a number, and learns as it should."""
+
+    def get_loss_dict(self, *args: Any, **options: Any) -> dict[str, Tensor]:
+        self.steps += 1
+        losses = NerfactoModel.get_loss_dict(self, *args, **options)
+        return {name: self.steps + loss for name, loss in losses.items()}
 
 
 class PeeksAtHeldOut(NerfactoModel):
@@ -272,7 +250,6 @@ HOST_MUTANTS: dict[str, dict[str, GuidedModelConfig]] = {
     "samples-shift-in-training": {"NeverShakenHost": packed(NeverShaken)},
     "teaches-the-host-alone": {
         "LearnsNothing": packed(LearnsNothing),
-        "HandsOutNothing": packed(HandsOutNothing),
         "HandsOutItsDummy": packed(HandsOutItsDummy),
         "Thaws": proposal(Thaws),
     },
@@ -289,6 +266,7 @@ HOST_MUTANTS: dict[str, dict[str, GuidedModelConfig]] = {
         "ShadesElsewhere": packed(ShadesElsewhere),
         "AsksThereToo": packed(AsksThereToo),
         "AsksAsItIs": packed(AsksAsItIs),
+        "DropsOneRayHost": packed(sampler="DropsOneRay"),
         "UniformHost": proposal(sampler="Uniform"),
     },
     "state-and-yaml-round-trip": {
@@ -300,22 +278,26 @@ HOST_MUTANTS: dict[str, dict[str, GuidedModelConfig]] = {
         "ForgetsBackground": packed(ForgetsBackground),
     },
     "guided-by-everything-is-dense": {
-        "EverySecondHost": packed(sampler="EverySecond"),
         "ThinsOneRayHost": packed(sampler="ThinsOneRay"),
         "NearHalfHost": proposal(sampler="NearHalf"),
     },
     "held-out-images-teach-nothing": {"PeeksAtHeldOut": proposal(PeeksAtHeldOut)},
-    "resumes-where-it-stopped": {"CountsSteps": proposal(CountsSteps)},
+    "resumes-where-it-stopped": {
+        "CountsSteps": proposal(CountsSteps),
+        "AddsItsSteps": proposal(AddsItsSteps),
+    },
     "two-processes-step-alike": {"LearnsOnFirstRank": packed(LearnsOnFirstRank)},
 }
 """By the rule that must fail, methods by name."""
+ALSO = {"DropsOneRayHost": {"guided-by-everything-is-dense"}}
+"""What else cannot hold for a mutant."""
 METHODS = {
     **SOUND,
     "Unguided": PACKED,
     **{name: model for family in HOST_MUTANTS.values() for name, model in family.items()},
 }
 SAMPLERS = {
-    "EverySecond": SamplerSpec("", estimator=EverySecond, needs_occupancy=True),
+    "DropsOneRay": SamplerSpec("", estimator=DropsOneRay, needs_occupancy=True),
     "ThinsOneRay": SamplerSpec("", estimator=ThinsOneRay, needs_occupancy=True),
     "NearHalf": SamplerSpec("", proposal=NearHalf, needs_occupancy=True),
 }

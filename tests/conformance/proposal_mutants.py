@@ -133,6 +133,19 @@ class LastFirst(Shifted):
         return starts.flip(1), ends.flip(1)
 
 
+class EndsBeyondTheRay(SoundProposal):
+    """The last sample has its middle just before the far end, and ends as far behind it as it
+    begins before it."""
+
+    def generate_ray_samples(self, ray_bundle: Any = None, density_fns: Any = None) -> Any:
+        samples, weights, candidates = super().generate_ray_samples(ray_bundle, density_fns)
+        places = samples.frustums
+        places.ends = places.ends.clone()
+        places.ends[:, -1] = 2.0 * ray_bundle.fars - places.starts[:, -1] - 1e-3
+        samples.deltas = places.ends - places.starts
+        return samples, weights, candidates
+
+
 class Shaking(Shifted):
     def change(self, starts: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
         shift = 1e-5 * torch.rand(()) * (not self.training)
@@ -150,6 +163,14 @@ class Uniform(SoundProposal):
 
     def worth(self, positions: Tensor) -> Tensor:
         return torch.ones_like(positions[..., :1])
+
+
+class UniformOnOneRay(SoundProposal):
+    """Everything on the first ray of a batch is worth the same."""
+
+    def worth(self, positions: Tensor) -> Tensor:
+        first = torch.arange(len(positions)).view(-1, 1, 1) == 0
+        return super().worth(positions).masked_fill(first, 1.0)
 
 
 class FrontOnly(SoundProposal):
@@ -288,11 +309,12 @@ PROPOSAL_MUTANTS: dict[str, tuple[type, ...]] = {
         WithoutMetadata,
         SqueezesBundles,
     ),
-    "sorted-disjoint-inside": (LastFirst,),
+    "sorted-disjoint-inside": (LastFirst, EndsBeyondTheRay),
     "deterministic-in-eval": (Shaking,),
     "stratified-in-training": (NeverShaken,),
     "skips-only-what-it-may": (
         Uniform,
+        UniformOnOneRay,
         FrontOnly,
         UniformInTraining,
         FromOutsideOnlyProposal,

@@ -1,4 +1,5 @@
-"""Packed hosts that shade other samples than those that are kept, most of them in evaluation."""
+"""Packed hosts that shade other samples than those that are kept, and samplers of hosts that give
+them too few."""
 
 from __future__ import annotations
 
@@ -7,9 +8,13 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
+from conformance.estimator_mutants import Answers
+from conformance.proposal_mutants import SoundProposal
 from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.models.instant_ngp import NGPModel
 from torch import Tensor
+
+from leco_plugin.samplers.marching import Samples
 
 
 class Shades(NGPModel):
@@ -86,3 +91,31 @@ class SamplesElsewhere(NGPModel):
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
         ray_bundle.origins = ray_bundle.origins - torch.tensor([0.5, -1.0, 2.0])
         return super().get_outputs(ray_bundle)
+
+
+class AsksAsItIs(NGPModel):
+    """Comes with an adapter that asks the gate in the host's coordinates, whatever its own are."""
+
+
+class ThinsOneRay(Answers):
+    """Leaves out one sample in eight of the first ray."""
+
+    def change(self, ray_indices: Tensor, t_starts: Tensor, t_ends: Tensor) -> Samples:
+        kept = (ray_indices > 0) | (torch.arange(len(ray_indices)) % 8 > 0)
+        return ray_indices[kept], t_starts[kept], t_ends[kept]
+
+
+class DropsOneRay(Answers):
+    """Has nothing on the first ray."""
+
+    def change(self, ray_indices: Tensor, t_starts: Tensor, t_ends: Tensor) -> Samples:
+        kept = ray_indices > 0
+        return ray_indices[kept], t_starts[kept], t_ends[kept]
+
+
+class NearHalf(SoundProposal):
+    """Draws from the nearer half of the places that are worth something."""
+
+    def worth(self, positions: Tensor) -> Tensor:
+        worth = super().worth(positions)
+        return worth * (worth.cumsum(dim=-2) <= 0.5 * worth.sum(dim=-2, keepdim=True))

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from conformance import batch_mutants, estimator_mutants, proposal_mutants
+from conformance import batch_mutants, estimator_mutants, host_mutants, proposal_mutants
 from conformance.estimator_mutants import MUTANTS
 from conformance.host_mutants import HOST_MUTANTS, METHODS, SOUND
 from conformance.mutant_plugin import write_distribution
@@ -31,7 +31,8 @@ BY_SEAM: dict[str, Any] = {
     "proposal": PROPOSAL_MUTANTS,
     "host": HOST_MUTANTS,
 }
-ALSO = estimator_mutants.ALSO | batch_mutants.ALSO | proposal_mutants.ALSO
+FAMILIES = estimator_mutants, batch_mutants, proposal_mutants, host_mutants
+ALSO: Any = {mutant: rules for family in FAMILIES for mutant, rules in family.ALSO.items()}
 ALL = [
     pytest.param(getattr(mutant, "__name__", mutant), {rule} | ALSO.get(mutant, set()), id=rule)
     for by_rule in BY_SEAM.values()

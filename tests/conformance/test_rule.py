@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from leco_plugin.conformance.estimators import _check_uniform
+from leco_plugin.conformance.proposals import all_kept_equals_dense
 from leco_plugin.conformance.rules import Broken, Rule, apply, require
 
 
@@ -130,3 +132,21 @@ def test_shifts_of_neighbours_are_neither_alike_nor_opposite():
     for other in (shares, 1.0 - shares):
         with pytest.raises(Broken, match="correlate by"):
             _check_uniform(torch.stack([shares, other], dim=1).flatten())
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.09, 0.91), (0.12, 1.0), (0.0, 0.88)])
+def test_a_proposal_sampler_of_its_own_reaches_both_ends_of_each_ray(low, high):
+    """One of three rays is sampled from `low` to `high` only."""
+    edges = torch.linspace(0.0, 1.0, 9).repeat(3, 1)
+    edges[1] = low + (high - low) * edges[1]
+    samples = SimpleNamespace(spacing_starts=edges[:, :-1, None], spacing_ends=edges[:, 1:, None])
+    case = SimpleNamespace(
+        shared=lambda scene: None,
+        answer=lambda *given: (samples, [], []),
+        needs_occupancy=False,
+    )
+    if low <= 0.1 and high >= 0.9:
+        all_kept_equals_dense(case)
+    else:
+        with pytest.raises(Broken, match=f"from {low:.0%} to {high:.0%} of it only"):
+            all_kept_equals_dense(case)
