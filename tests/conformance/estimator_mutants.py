@@ -151,7 +151,7 @@ class KeepsTooLittle(Sound):
     """Asks for more than the calibrated threshold."""
 
     def occupied(self, positions: Tensor) -> Tensor:
-        return self.occupancy.query(positions) >= 0.999
+        return self.occupancy.query(positions) >= 0.995
 
 
 class KeepsAllInTraining(Sound):
