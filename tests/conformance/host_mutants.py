@@ -150,6 +150,17 @@ class KeepsGrid(NGPModel):
     """Comes with an adapter that exchanges the grid in one of its two places."""
 
 
+class HandsOutTheGone(NerfactoModel):
+    """Has in an optimizer the proposal networks that it was built with."""
+
+    def populate_modules(self) -> None:
+        super().populate_modules()
+        self.scouts = [*self.proposal_networks.parameters()]
+
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        return super().get_param_groups() | {"proposal_networks": self.scouts}
+
+
 class GuidedTwice(NGPModel):
     """Comes with an adapter that has the gate in the checkpoint twice."""
 
@@ -158,6 +169,15 @@ class DividesByOpacity(NGPModel):
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
         outputs = super().get_outputs(ray_bundle)
         return outputs | {"depth": outputs["depth"] / outputs["accumulation"]}
+
+
+class SeemsOpaque(NGPModel):
+    """Says of a ray that has met nothing that it ended at something."""
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
+        outputs = super().get_outputs(ray_bundle)
+        met = outputs["accumulation"]
+        return outputs | {"accumulation": met.where(met > 0.0, 1.0)}
 
 
 class ForgetsBackground(NGPModel):
@@ -257,6 +277,7 @@ HOST_MUTANTS: dict[str, dict[str, GuidedModelConfig]] = {
         "KeepsScouts": proposal(KeepsScouts),
         "KeepsGrid": packed(KeepsGrid),
         "GuidedTwice": packed(GuidedTwice),
+        "HandsOutTheGone": proposal(HandsOutTheGone),
     },
     "shades-only-what-is-kept": {
         "FillsUp": packed(FillsUp),
@@ -276,6 +297,7 @@ HOST_MUTANTS: dict[str, dict[str, GuidedModelConfig]] = {
     "empty-rays-show-background": {
         "DividesByOpacity": packed(DividesByOpacity),
         "ForgetsBackground": packed(ForgetsBackground),
+        "SeemsOpaque": packed(SeemsOpaque),
     },
     "guided-by-everything-is-dense": {
         "ThinsOneRayHost": packed(sampler="ThinsOneRay"),
