@@ -60,7 +60,7 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
         figure.text(0.015, TOP, title, va="top", fontsize=17, fontweight="bold")
         below = TOP - 0.01 - LINE_HEIGHT * (title.count("\n") + 1)
         said = [f"{finding_of(results)}.", circumstances(results)]
-        said = [line for one in said for line in textwrap.wrap(one, TEXT_WIDTH)]
+        said = [line for one in said for line in balanced(one, TEXT_WIDTH).splitlines()]
         figure.text(0.015, below, "\n".join(said), va="top", fontsize=11.5, parse_math=False)
         below -= SMALL_LINE_HEIGHT * (len(said) - 1)
         if shown.space:
@@ -70,9 +70,9 @@ def draw(results: Mapping[str, Any], path: Path, theme: Theme = LIGHT) -> Path:
         return save_picture(figure, path, results, dpi=160)
 
 
-def balanced(text: str) -> str:
-    """A text in as few lines as `TITLE_WIDTH` allows, all about as long."""
-    lines, widths = len(textwrap.wrap(text, TITLE_WIDTH)), range(1, TITLE_WIDTH + 1)
+def balanced(text: str, width: int = TITLE_WIDTH) -> str:
+    """A text in as few lines of so many letters as hold it, all about as long."""
+    lines, widths = len(textwrap.wrap(text, width)), range(1, width + 1)
     return textwrap.fill(text, next(n for n in widths if len(textwrap.wrap(text, n)) <= lines))
 
 
