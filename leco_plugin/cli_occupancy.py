@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -68,7 +69,7 @@ def inspect(
 
     file = occupancy_of(file)
     written = {"--picture": picture, "the page of --picture": page, "--history": history}
-    check_apart({**written, "--json": json}, file, data)
+    _check_apart({**written, "--json": json}, file, data)
     occupancy = Occupancy.load(file)
     scene = None if picture is None else scene_of(occupancy, file, data)
     if history is not None:
@@ -138,7 +139,9 @@ def export(
     start = format == "splat-init" and out.suffix == ".json"
     points = out.with_suffix(".ply") if start else None
     check_apart({"--out": out, "the points of --out": points, "--json": json}, file)
-    check_apart({"--json": json}, data)
+    # a start for splats has lines of its own about the scene's files, and a folder may be the scene
+    is_file = format is not None and format != "splat-init"
+    _check_apart({"--json": json, **({"--out": out} if is_file else {})}, file, data)
     if format is not None:
         facts = made.export(file, format, out, resolution, levels, frame, data)
         print("\n".join(_export_in_words(out, facts, frame)))
@@ -220,6 +223,15 @@ def shrink(
     write_report(json, results)
     if picture is not None:
         print(f"drew {draw_gates(results, picture)}")
+
+
+def _check_apart(written: Mapping[str, Path | None], file: Path, data: Path | None) -> None:
+    """`check_apart` of an occupancy and its scene `data`; None is that of the run it lies in."""
+    if data is None and any(written.values()):
+        from leco_plugin.scenes.coloured_points import description_of_run
+
+        data = description_of_run(file)
+    check_apart(written, file, data)
 
 
 def _draw(occupancy: Occupancy, picture: Path, description: Path | None, dark: bool) -> None:

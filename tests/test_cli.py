@@ -308,6 +308,12 @@ def test_a_place_that_cannot_be_written_to_is_named_before_anything_is_read_or_w
         ["shrink", "{file}", "--data", "{scene}", "--out", "x", "--json", "{scene}"],
         ["shrink", "{file}", "--data", "{folder}", "--out", "{points}"],
         ["inspect", "{file}", "--data", "{scene}", "--picture", "{photograph}"],
+        ["inspect", "{file}", "--picture", "{photograph}"],
+        ["inspect", "{file}", "--picture", "{other}"],
+        ["inspect", "{file}", "--json", "{scene}"],
+        ["export", "{file}", "--format", "ply", "--data", "{folder}", "--out", "{points}"],
+        ["export", "{file}", "--format", "npz", "--out", "{scene}"],
+        ["export", "{file}", "--out", "x", "--json", "{scene}"],
         ["swap", "nerfacto", "--occupancy", "{file}", "--json", "{file}"],
         ["swap", "nerfacto", "--occupancy", "{folder}", "--json", "{file}"],
         ["points", "{folder}", "--json", "{scene}"],
@@ -328,11 +334,12 @@ def test_no_command_writes_over_what_it_reads_or_over_what_it_has_just_written(
     file.parent.mkdir()
     ball().save(file)
     places = {"file": file, "folder": here, "scene": here / "transforms.json"}
-    places |= {name: here / f"{name}.png" for name in ("photograph", "points")}
-    frames = [{"file_path": "photograph.png"}]
+    places |= {name: here / f"{name}.png" for name in ("photograph", "other", "points")}
+    frames = [{"file_path": "photograph.png"}, {"file_path": "other"}]  # its ending is found
     places["scene"].write_text(json.dumps({"frames": frames, "ply_file_path": "points.png"}))
-    for name in ("photograph", "points"):
+    for name in ("photograph", "other", "points"):
         places[name].write_text(name)
+    (file.parent / "config.yml").write_text(f"pipeline: {{datamanager: {{data: [{here}]}}}}")
     before, arguments = file.read_bytes(), [part.format(**places) for part in command]
     assert f"leco: {command[-2]} {arguments[-1]} is a file that" in refused(*arguments)
     assert file.read_bytes() == before and not (here / "x.ply").exists()

@@ -136,11 +136,14 @@ def check_apart(written: Mapping[str, Path | None], *read: Path | None) -> None:
 
 def _named_in(path: Path) -> set[Path]:
     """Photographs, masks and points that a transforms.json names; of any other file none."""
+    from leco_plugin.scenes.photograph_files import find_file
+
     named: set[Path] = set()
 
     def note(part: dict[str, Any]) -> None:
         names = [value for key, value in part.items() if key.endswith("path")]
-        named.update((path.parent / each).resolve() for each in names if isinstance(each, str))
+        files = [path.parent / each for each in names if isinstance(each, str)]
+        named.update(find_file(each).resolve() for each in files)
 
     if path.suffix == ".json":
         with suppress(OSError, ValueError):  # a damaged one is said when it is read
