@@ -144,7 +144,9 @@ def _launching_once(launcher: Any, launch: Any, on_cpu: bool) -> Any:
     @functools.wraps(launch)
     def launching(*arguments: Any, **options: Any) -> Any:
         launcher.launch, own = launch, launcher._distributed_worker
-        launcher._distributed_worker = process if on_cpu else own
+        # the launch that was prepared may not have come: its run was refused
+        ours = on_cpu and options.get("device_type", "cpu") == "cpu"
+        launcher._distributed_worker = process if ours else own
         try:
             return launch(*arguments, **options)
         except ProcessExitedException as error:

@@ -90,6 +90,13 @@ def test_a_launch_that_fails_leaves_nerfstudio_as_it_was(monkeypatch: pytest.Mon
     assert ns_train.launch is fails and ns_train._distributed_worker is worker
 
 
+def test_a_run_that_was_refused_leaves_no_process_to_one_on_cuda() -> None:
+    config("cpu", 2).set_timestamp()  # and its folder cannot be written
+    assert ns_train.launch(device_type="cuda") is ns_train._distributed_worker
+    config("cpu", 2).set_timestamp()
+    assert ns_train.launch(device_type="cpu") is process
+
+
 def test_a_caller_may_name_a_device_for_a_module_on_a_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
     given: dict[str, Any] = {}
     monkeypatch.setattr(
