@@ -85,7 +85,7 @@ def write_film(
 
 
 def read_history(occupancy: Occupancy, folder: Path) -> GateHistory:
-    """The history in the folder of a run. InputError for none, or one of another gate."""
+    """The history in the folder of a run. ValueError for none, or one of another gate."""
     file = folder / FILE_NAME
     try:
         return GateHistory.load(file, as_learned(occupancy).gate)
