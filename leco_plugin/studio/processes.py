@@ -63,7 +63,7 @@ class DataParallelTrainerConfig(TrainerConfig):
         self._require_what_is_named()
         require_startable(self.machine)
         if self.machine.num_devices * self.machine.num_machines > 1:
-            prepare_launcher(on_cpu=self.machine.device_type == "cpu")
+            prepare_launcher()
 
     def _require_what_is_named(self) -> None:
         """InputError, before anything of a run is written, if there is no step to take, no ray in a
@@ -128,25 +128,24 @@ def require_startable(machine: MachineConfig) -> None:
         )
 
 
-def prepare_launcher(on_cpu: bool) -> None:
+def prepare_launcher() -> None:
     """Has nerfstudio's next launch of processes end in one line when one is lost, or on a CPU start
     `process` in place of its own; after it, or an error in it, the launcher is its own again."""
     for name in ("nerfstudio.scripts.train", "__main__"):
         launcher: Any = sys.modules.get(name)
         if hasattr(launcher, "launch") and hasattr(launcher, "_distributed_worker"):
             own = getattr(launcher.launch, "of_nerfstudio", launcher.launch)
-            launcher.launch = _launching_once(launcher, own, on_cpu)
+            launcher.launch = _launching_once(launcher, own)
 
 
-def _launching_once(launcher: Any, launch: Any, on_cpu: bool) -> Any:
+def _launching_once(launcher: Any, launch: Any) -> Any:
     """What stands for `launch` of a module until it has been called."""
 
     @functools.wraps(launch)
     def launching(*arguments: Any, **options: Any) -> Any:
         launcher.launch, own = launch, launcher._distributed_worker
-        # the launch that was prepared may not have come: its run was refused
-        ours = on_cpu and options.get("device_type", "cpu") == "cpu"
-        launcher._distributed_worker = process if ours else own
+        if options.get("device_type") == "cpu":
+            launcher._distributed_worker = process
         try:
             return launch(*arguments, **options)
         except ProcessExitedException as error:

@@ -36,7 +36,7 @@ def started(made: DataParallelTrainerConfig) -> Any:
     before = ns_train.launch, ns_train._distributed_worker
     made.set_timestamp()
     assert ns_train._distributed_worker is before[1]
-    found = ns_train.launch(config=made)
+    found = ns_train.launch(config=made, device_type=made.machine.device_type)
     assert (ns_train.launch, ns_train._distributed_worker) == before
     return found
 
@@ -70,10 +70,10 @@ def test_all_others_are_left_to_nerfstudio(
 
 def test_a_launcher_that_is_run_as_a_script_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     script = SimpleNamespace(_distributed_worker=None)
-    script.launch = own = lambda: script._distributed_worker
+    script.launch = own = lambda **_: script._distributed_worker
     monkeypatch.setitem(sys.modules, "__main__", script)
     config("cpu", 2).set_timestamp()
-    assert script.launch() is process
+    assert script.launch(device_type="cpu") is process
     assert script.launch is own and script._distributed_worker is None
 
 

@@ -23,7 +23,7 @@ def launching(error: Exception) -> Any:
         raise error
 
     script = SimpleNamespace(launch=launch, _distributed_worker=None)
-    return _launching_once(script, launch, on_cpu=True)
+    return _launching_once(script, launch)
 
 
 def raised(line: str) -> ProcessRaisedException:
