@@ -75,7 +75,7 @@ def inspect(
     if history is not None:
         from leco_plugin.evaluation.history_picture import draw_history, read_history
 
-        read_history(occupancy, file.parent)  # a fault of it is said before the picture is drawn
+        looks = read_history(occupancy, file.parent)  # a fault is said before anything is drawn
     facts = {**describe(occupancy), "bytes": file.stat().st_size}
     space = facts["space"]
     print(f"{file}: {facts['params']} parameters in {facts['bytes'] / 1000:.1f} kB")
@@ -93,7 +93,7 @@ def inspect(
     if picture is not None:
         _draw(occupancy, picture, scene, dark)
     if history is not None:
-        print(f"drew {draw_history(occupancy, file.parent, history)}")
+        print(f"drew {draw_history(occupancy, looks, history)}")
     write_report(json, facts)
 
 

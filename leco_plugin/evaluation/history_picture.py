@@ -41,15 +41,12 @@ OPAQUE = 1e4
 """Density, per half extent, that is drawn for more: opaque within a ten-thousandth."""
 
 
-def draw_history(occupancy: Occupancy, folder: Path, path: Path) -> Path:
-    """Draws how an occupancy was learned, from the history in the folder of its run. A .gif moves;
-    other pictures show the first look, two between, and the last.
-
-    Raises:
-        ValueError: the run has no history, or one of another gate.
-        OSError, ValueError: the picture cannot be written there, or is of no known kind.
+def draw_history(occupancy: Occupancy, history: GateHistory, path: Path) -> Path:
+    """Draws how an occupancy was learned. A .gif moves; other pictures show the first look, two
+    between, and the last. OSError or ValueError if it cannot be written there, or is of no known
+    kind.
     """
-    film = _Film(occupancy, read_history(occupancy, folder))
+    film = _Film(occupancy, history)
     count, frames = len(film.history), []
     if path.suffix.lower() != ".gif":
         return save_whole(film.still(spread_evenly(count, STILL)), path, dpi=DPI)

@@ -16,7 +16,7 @@ from leco_plugin.chart.theme import LIGHT
 from leco_plugin.cli import main
 from leco_plugin.evaluation import history_picture
 from leco_plugin.evaluation.metrics import spread_evenly
-from leco_plugin.learning.history import FILE_NAME, GateHistory
+from leco_plugin.learning.history import GateHistory
 
 
 @pytest.fixture
@@ -34,6 +34,10 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     history.save(tmp_path)
     ball().save(tmp_path / "occupancy.safetensors")
     return tmp_path
+
+
+def looks_in(run: Path) -> GateHistory:
+    return history_picture.read_history(ball(), run)
 
 
 def test_a_full_disk_leaves_the_older_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -103,12 +107,12 @@ def test_a_long_history_is_shown_evenly(run: Path, monkeypatch: pytest.MonkeyPat
     steps = [b - a for a, b in pairwise(shown)]
     assert max(steps) - min(steps) <= 1
     monkeypatch.setattr(history_picture, "MOST_FRAMES", 2)
-    with Image.open(history_picture.draw_history(ball(), run, run / "short.gif")) as film:
+    with Image.open(history_picture.draw_history(ball(), looks_in(run), run / "short.gif")) as film:
         assert film.n_frames == 2
 
 
 def test_lines_of_a_film_end_at_its_look(run: Path) -> None:
-    film = history_picture._Film(ball(), GateHistory.load(run / FILE_NAME, ball().gate))
+    film = history_picture._Film(ball(), looks_in(run))
     for look, figure in enumerate(film.moving([0, 1, 2])):
         for axes in figure.axes[2:]:
             assert [list(line.get_xdata()) for line in axes.lines] == [[0, 10, 20][: look + 1]] * 3
@@ -123,7 +127,7 @@ def test_lines_of_a_film_end_at_its_look(run: Path) -> None:
 
 
 def test_a_still_picture_is_drawn_too(run: Path) -> None:
-    path = history_picture.draw_history(ball(), run, run / "learned.png")
+    path = history_picture.draw_history(ball(), looks_in(run), run / "learned.png")
     with Image.open(path) as picture:
         assert picture.width > 100
 
