@@ -47,9 +47,10 @@ class CalibrationConfig:
     camera_surface_mass: float = 2e-3
     """Largest share of the weight near surfaces that any photograph may lose that vouches."""
     cameras: int = 9
-    """Training photographs that teach an occupancy nothing, and vouch for it: what none of so many
-    loses, another view loses with a chance of one in one more. Their pixels train the field once it
-    is frozen. 0 is none; nor are there any where they would be more than a quarter."""
+    """Training photographs that teach a learned gate nothing, and vouch for it: what none of these
+    loses, another view loses with a chance of one in one more. Once it is frozen they train the
+    field, and teach a small gate too. 0 is none; nor are there any where they would be more than a
+    quarter."""
     camera_rays: int = 512
     """Rays of each to measure with."""
     rays: int = 8192
@@ -163,18 +164,18 @@ def promise(
 
     Were photographs drawn at random, another one would lose more than the worst of K with a chance
     of 1 in K + 1 at most, because a loss never falls as the threshold rises: split conformal
-    prediction, as in Angelopoulos et al., "Conformal Risk Control", 2022. Where they chose two
-    thresholds, one after the other, it is 2 in K + 1.
+    prediction, as in Angelopoulos et al., "Conformal Risk Control", 2022. A small gate they have
+    taught themselves: they say what they lose, and of other views nothing, with no confidence.
     """
     if not cameras:
         return None
     worst = worst_loss(cameras, measured.threshold) + _worst_so_far(spent)
-    chosen = 2 if spent.get(CAMERAS_THAT_VOUCH) else 1
+    confidence = round(len(cameras) / (len(cameras) + 1), 3)
     return {
         "count": len(cameras),
         "worst_surface_mass": worst,
         "bound": max(worst, config.camera_surface_mass),
-        "confidence": round((len(cameras) + 1 - chosen) / (len(cameras) + 1), 3),
+        "confidence": None if spent.get(CAMERAS_THAT_VOUCH) else confidence,
     }
 
 

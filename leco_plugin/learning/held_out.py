@@ -137,7 +137,7 @@ class HeldOut(PriceSource):
 
     def sharpened(self, losses: GateLossConfig, config: SharpeningConfig) -> Sharpened | None:
         """A small gate that training pixels teach and these calibrate; see `sharpen`."""
-        taught = self.data.training_rays(self.mixture, config.rays, self.config.cameras)
+        taught = self.data.training_rays(self.mixture, config.rays)
         rays, cameras = self.rays(self.config.rays), self.cameras()
         return sharpen(self.mixture, taught, rays, cameras, losses, self.config, config)
 

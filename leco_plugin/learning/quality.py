@@ -64,15 +64,18 @@ def price_in_words(report: dict[str, Any]) -> list[str]:
 
 
 def views_in_words(report: dict[str, Any]) -> str:
-    """What an occupancy's report says of views that taught it nothing: a line."""
+    """What an occupancy's report says of whole views: a line."""
     said = report.get(CAMERAS_THAT_VOUCH)
     if not isinstance(said, dict):
         return "calibrated on pixels of training photographs alone: new views may lose more"
     lose = by_number(said["count"], "loses", "lose")
     of_their = by_number(said["count"], "its", "their")
+    photographs = counted(said["count"], "photograph")
+    at_most = f"{lose} at most {said['worst_surface_mass']:.2%} of {of_their} surfaces"
+    if said["confidence"] is None:
+        return f"{photographs} {at_most}; now they teach it too, and new views may lose more"
     return (
-        f"{counted(said['count'], 'photograph')} that taught it nothing {lose} at most "
-        f"{said['worst_surface_mass']:.2%} of {of_their} surfaces: a new view loses at most "
+        f"{photographs} that taught it nothing {at_most}: a new view loses at most "
         f"{said['bound']:.2%}, with {said['confidence']:.0%} confidence"
     )
 

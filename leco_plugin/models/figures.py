@@ -14,7 +14,6 @@ from leco_plugin.learning.calibration import LOSSES
 from leco_plugin.models.gate import EMPTY, occupancy_from_logits
 from leco_plugin.models.losses import expert_statistics
 from leco_plugin.models.rendering import MET, Intervals, Rays, Shaded, backdrop_of, sum_up
-from leco_plugin.samplers.packed import accumulate_along_rays
 from leco_plugin.samplers.rays import candidate_counts
 
 NONE = -1
@@ -44,18 +43,17 @@ def before_the_backdrop(
 
 
 @torch.no_grad()
-def gate_pictures(met: Shaded, ray_indices: Tensor) -> dict[str, Tensor]:
+def gate_pictures(
+    met: Shaded, ray_indices: Tensor, occupancies: Tensor, experts: int
+) -> dict[str, Tensor]:
     """What the gate did along each ray, for the viewer: each [R, 1] float32.
 
-    `occupancy` is o(x), averaged with the rendering weights; `expert` is `leading_expert`; both are
-    0 where nothing is met. `met` is without the weight of backdrops.
+    `occupancy` is o(x) [R] at the depth, `expert` is `leading_expert` of so many; both are 0 where
+    nothing is met. `met` is without the weight of backdrops.
     """
-    occupancies = occupancy_from_logits(met.logits)[:, None]
-    seen = accumulate_along_rays(met.weights, occupancies, ray_indices, len(met.rgb))
-    expert = leading_expert(met, ray_indices, met.logits.shape[-1])
-    met_something = met.accumulation[:, None] >= MET
+    expert = leading_expert(met, ray_indices, experts)
     return {
-        "occupancy": (seen / met.accumulation.clamp(min=MET)[:, None]).where(met_something, 0.0),
+        "occupancy": occupancies.where(met.accumulation >= MET, 0.0)[:, None],
         "expert": expert.clamp(min=EMPTY).float(),
         "samples_per_ray": met.packed_info[:, 1:].float(),  # nerfstudio cannot show integers
     }
@@ -151,9 +149,12 @@ def kept_fraction(
     Returns:
         Float scalar in [0, 1].
     """
-    kept = (occupancy_from_logits(shaded.logits) >= above) | backdrop_of(intervals, rays)
+    kept = torch.tensor(len(shaded.weights), device=shaded.weights.device)
+    if above > 0.0:
+        likely = occupancy_from_logits(shaded.logits) >= above
+        kept = (likely | backdrop_of(intervals, rays)).sum()
     candidates = candidate_counts(rays.t_mins, rays.t_maxs, step_size, cone_angle).sum()
-    return (kept.sum() / candidates.clamp(min=1.0)).clamp(max=1.0)
+    return (kept / candidates.clamp(min=1.0)).clamp(max=1.0)
 
 
 def prices(report: dict[str, Any]) -> dict[str, Tensor]:

@@ -122,7 +122,7 @@ def samples_of(starts: Tensor, counts: Tensor, most: int) -> Tensor:
 
 def suits_native(scene: Scene, rays: Rays, intervals: Intervals) -> bool:
     """Whether `front_to_back.c` serves."""
-    field, gate, _, routing = scene
+    field, gate, _, routing, _ = scene
     by_threshold = routing.empty_below is not None and not routing.homogeneous
     known = (
         by_threshold
@@ -146,7 +146,7 @@ def shade_natively(scene: Scene, rays: Rays, intervals: Intervals) -> tuple[Shad
     """`shade_front_to_back` in C; `evaluation/queries.py` counts what it asks."""
     color = scene.field.color
     ray_indices, t_starts, t_ends = intervals
-    count, outputs = len(rays.origins), scene.gate.head.out_features
+    count = len(rays.origins)
     starts, counts = pack_info(ray_indices, count).T.contiguous()
     with torch.autocast("cpu", enabled=False):
         of_rays = color.hidden_of_rays(rays.directions, rays.images, rays.origins).contiguous()
@@ -164,7 +164,6 @@ def shade_natively(scene: Scene, rays: Rays, intervals: Intervals) -> tuple[Shad
         "t_ends": torch.empty_like(t_starts),
         "weights": torch.empty_like(t_starts),
         "sigmas": torch.empty_like(t_starts),
-        "logits": t_starts.new_empty(len(t_starts), outputs),
     }
     asked = native.call_along_rays(
         "front_to_back",
@@ -195,12 +194,13 @@ def shade_natively(scene: Scene, rays: Rays, intervals: Intervals) -> tuple[Shad
     packed_info = torch.stack([ends - totals["asked"], totals["asked"]], dim=-1)
     accumulation = totals["accumulation"]
     depth = mean_distance(accumulation, totals["distance"], rays)
+    of["logits"] = depth.new_empty(len(of["weights"]), 0)  # of pictures nobody asks for them
     return Shaded(totals["rgb"], accumulation, depth, **of, packed_info=packed_info), seen
 
 
 def in_c(scene: Scene) -> native.Values:
     """As `front_to_back.c: Scene` has it."""
-    field, gate, space, routing = scene
+    field, gate, space, routing, kept = scene
     encoding, waves = field.encoding, gate.encoding
     assert isinstance(encoding, HashEncoding) and isinstance(waves, FrequencyEncoding)
     empty_below = routing.empty_below or 0.0
@@ -222,7 +222,7 @@ def in_c(scene: Scene) -> native.Values:
         "fresh": FRESH[torch.float32],
         "gate_layers": len(gate.hidden),
         "gate_width": gate.config.width,
-        "outputs": gate.head.out_features,
+        "outputs": 0 if kept else gate.head.out_features,
         "levels": levels,
         "log2": native.log2_of(rows // levels),
         "features": features,

@@ -170,7 +170,7 @@ class LecoModel(DrawnInViewer, Model):
         if self.training:
             kept = len(intervals.t_starts) / max(len(rays.origins), 1) - 1.0
             self.kept_per_ray = kept if mixture.skips else 1.0
-            shaded = mixture.shade(rays, intervals)
+            shaded = mixture.shade(rays, intervals, kept=True)
             likely = max(KEPT_ABOVE, self.config.likely_above)
             above = 0.0 if mixture.is_frozen else likely  # a frozen gate has left out the others
             return {
@@ -185,7 +185,10 @@ class LecoModel(DrawnInViewer, Model):
         shaded, intervals = mixture.show(rays, intervals, self.config.front_to_back)
         met, shown = figures.before_the_backdrop(shaded, intervals, rays)
         colors = figures.over_background(shaded, rays)
-        return {"rgb": colors, **shown, **figures.gate_pictures(met, intervals.ray_indices)}
+        ends = rays.origins + rays.directions * met.depth[:, None]
+        occupancies = mixture.occupancies(mixture.region.space.map(ends))
+        of_gate = met, intervals.ray_indices, occupancies, 1 + mixture.sizes.gate.scene_experts
+        return {"rgb": colors, **shown, **figures.gate_pictures(*of_gate)}
 
     get_rgba_image = staticmethod(figures.with_alpha)
     get_image_metrics_and_images = figures.image_figures

@@ -183,10 +183,10 @@ class Mixture(nn.Module):
         """Ends each ray in its backdrop, which no gate skips."""
         return with_backdrop(intervals, rays, *self.rule(coarse))
 
-    def shade(self, rays: Rays, intervals: Intervals) -> Shaded:
-        """Renders intervals; no gradient reaches a frozen gate."""
+    def shade(self, rays: Rays, intervals: Intervals, kept: bool = False) -> Shaded:
+        """Renders intervals; no gradient reaches a frozen gate. `kept` is as of `scene`."""
         with gate_precision(self.device.type, self.precision):
-            return shade(self.scene(), rays, intervals, freeze_gate=self.is_frozen)
+            return shade(self.scene(kept), rays, intervals, freeze_gate=self.is_frozen)
 
     @torch.no_grad()
     def weigh(self, rays: Rays, intervals: Intervals) -> Tensor:
@@ -202,26 +202,38 @@ class Mixture(nn.Module):
         with gate_precision(self.device.type, self.precision):
             return ask_at(self.scene(), mapped, freeze_gate=True)
 
-    def scene(self) -> Scene:
-        """Whom renderings ask."""
-        return Scene(self.field, self.gate, self.region.space, self.routing)
+    def scene(self, kept: bool = False) -> Scene:
+        """Whom renderings ask, and how. Where a gate skips and there is one scene expert, that
+        expert has all that is kept, and the gate that skips says of the rest what is empty.
+
+        Args:
+            kept: whether only backdrops, and what `kept` returns, is asked about.
+        """
+        gate, routing = self.gate, self.routing
+        by_threshold = routing.empty_below is not None and not routing.homogeneous
+        alone = self.skips and by_threshold and self.sizes.gate.scene_experts == 1
+        if alone and not kept:
+            gate = self.small or gate
+            below = min(float(on_cpu(self.threshold)), routing.empty_below or 0.0)
+            routing = routing._replace(empty_below=below)
+        return Scene(self.field, gate, self.region.space, routing, alone and kept)
 
     def show(
         self, rays: Rays, intervals: Intervals, front_to_back: bool | None
     ) -> tuple[Shaded, Intervals]:
-        """As `shade`, with the intervals that were shaded.
+        """As `shade`, of backdrops and what `kept` returns, with the intervals that were shaded.
 
         Args:
             front_to_back: whether to leave out what lies behind opaque surfaces, without gradients;
                 None does so where that was measured to be no slower.
         """
-        given = self.scene(), rays, intervals
+        given = self.scene(kept=True), rays, intervals
         with gate_precision(self.device.type, self.precision):
             if front_to_back is None:
                 front_to_back = is_no_slower(*given, self.skips)
             if front_to_back:
                 return shade_front_to_back(*given)
-        return self.shade(rays, intervals), intervals
+        return self.shade(rays, intervals, kept=True), intervals
 
     @torch.no_grad()
     def freeze(self, threshold: float, report: dict[str, Any]) -> None:

@@ -94,6 +94,9 @@ class Scene(NamedTuple):
     space: Space
     """How positions are mapped for both."""
     routing: Routing
+    kept: bool = False
+    """Whether a frozen gate has let all through that is asked about, and the only scene expert has
+    it: then nobody asks the gate again."""
 
 
 def gate_values_and_routes(
@@ -214,7 +217,8 @@ class Answers(NamedTuple):
     features: Tensor
     """[M, width] of which colour is made."""
     logits: Tensor
-    """[M, 1 + n] of the gate; Switch-NeRF's has no empty-space expert."""
+    """[M, 1 + n] of the gate, [M, 0] where it was not asked; Switch-NeRF's has no empty-space
+    expert."""
     routes: Tensor
     """[M] int64, the expert of each point."""
 
@@ -226,10 +230,14 @@ def ask(scene: Scene, rays: Rays, intervals: Intervals, freeze_gate: bool) -> An
 
 def ask_at(scene: Scene, mapped: Tensor, freeze_gate: bool) -> Answers:
     """Asks gate and field at mapped positions [M, 3] in [-1, 1]; `freeze_gate` as for `shade`."""
-    with torch.set_grad_enabled(torch.is_grad_enabled() and not freeze_gate):
-        logits = scene.gate(mapped)
-        remaining = scene.field.experts.remaining_experts()
-        gate_values, routes = gate_values_and_routes(logits, scene.routing, remaining)
+    if scene.kept:
+        logits, gate_values = mapped.new_empty(len(mapped), 0), mapped.new_ones(len(mapped))
+        routes = torch.ones_like(gate_values, dtype=torch.int64)
+    else:
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not freeze_gate):
+            logits = scene.gate(mapped)
+            remaining = scene.field.experts.remaining_experts()
+            gate_values, routes = gate_values_and_routes(logits, scene.routing, remaining)
     sigmas, features = scene.field.density(mapped, routes, gate_values)
     return Answers(sigmas, features, logits, routes)
 

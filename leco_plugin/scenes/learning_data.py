@@ -134,12 +134,10 @@ class LearningData:
     ) -> tuple[Rays, Tensor]:
         return held_out_rays(mixture, self.manager, count, seed, share)
 
-    def training_rays(self, mixture: Mixture, count: int, set_aside: int = 0) -> Rays:
-        """Rays [count] of random training pixels, cut to a mixture's region. `set_aside` is as of
-        `prepare_batch`, and for this draw only."""
-        self.prepare_batch(1.0, distances=False, set_aside=set_aside)
-        drawn = [_rays_of(mixture, each) for each in training_bundles(self.manager, count)]
+    def training_rays(self, mixture: Mixture, count: int) -> Rays:
+        """Rays [count] of random training pixels, cut to a mixture's region."""
         self.prepare_batch(1.0, distances=False)
+        drawn = [_rays_of(mixture, each) for each in training_bundles(self.manager, count)]
         joined: Any = [None if p[0] is None else torch.cat(p)[:count] for p in zip(*drawn)]
         return Rays(*joined)
 

@@ -144,7 +144,7 @@ def test_a_small_gate_may_cost_only_what_the_large_one_has_left() -> None:
     mixture.report = report_of(0.6) | {CAMERAS_THAT_VOUCH: vouched(0.001, 0.002)}
     found = sharpen(mixture, *data, views, LOSSES, bounds, config)
     assert found is not None and found.measured.threshold > 0.0 and found.promised is not None
-    assert found.promised["worst_surface_mass"] >= 0.001 and found.promised["confidence"] == 0.0
+    assert found.promised["worst_surface_mass"] >= 0.001 and found.promised["confidence"] is None
     mixture.report |= {"lost_surface_mass": 2.0 * bounds.lost_surface_mass}
     spent = sharpen(mixture, *data, views, LOSSES, bounds, config)
     assert spent is not None and spent.measured.threshold == 0.0 and not spent.pays
@@ -173,7 +173,7 @@ class Pixels:
         self.mixture = mixture
         self.survey = None
 
-    def training_rays(self, mixture: Mixture, count: int, set_aside: int) -> Rays:
+    def training_rays(self, mixture: Mixture, count: int) -> Rays:
         return some_rays(mixture, count)
 
     def held_out(self, mixture: Mixture, count: int, *_: Any) -> tuple[Rays, Tensor]:

@@ -55,21 +55,23 @@ def test_nothing_is_drawn_of_them_until_all_train(data: LearningData) -> None:
     assert {5, 15, 25, 35} <= set(drawn.tolist())
 
 
-def test_for_one_draw_of_rays_they_are_set_aside(
+def test_rays_that_teach_a_small_gate_are_of_all_photographs(
     data: LearningData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sampler = data.manager.train_pixel_sampler
-    aside: list[list[int]] = []
+    aside: list[object] = []
+    data.prepare_batch(1.0, distances=False, set_aside=4)
+    assert sampler.set_aside is not None
 
     def bundles(_: Any, count: int) -> Iterator[RayBundle]:
-        aside.append(sampler.set_aside.nonzero()[:, 0].tolist())
+        aside.append(sampler.set_aside)
         images = torch.zeros(count + 1, 1, dtype=torch.int64)
         ahead = torch.tensor([[1.0, 0.0, 0.0]]).expand(count + 1, 3)
         yield RayBundle(torch.zeros(count + 1, 3), ahead, torch.ones(count + 1, 1), images)
 
     monkeypatch.setattr(learning_data, "training_bundles", bundles)
-    assert len(data.training_rays(small_mixture(), 7, set_aside=4).origins) == 7
-    assert aside == [[5, 15, 25, 35]] and sampler.set_aside is None
+    assert len(data.training_rays(small_mixture(), 7).origins) == 7
+    assert aside == [None]
 
 
 @pytest.mark.parametrize("images", [[torch.zeros(6, 7, 3)] * 16, torch.zeros(16, 6, 7, 3)])
@@ -98,6 +100,8 @@ SAID = {"count": 9, "worst_surface_mass": 0.00123, "bound": 0.002, "confidence":
 def test_what_views_may_lose_and_skipping_costs_is_said_in_a_line_each() -> None:
     line = views_in_words({CAMERAS_THAT_VOUCH: SAID})
     assert "0.12%" in line and "0.20%, with 90%" in line
+    line = views_in_words({CAMERAS_THAT_VOUCH: SAID | {"confidence": None}})
+    assert "9 photographs lose at most 0.12%" in line and "may lose more" in line
     assert "may lose more" in views_in_words({}) == views_in_words({CAMERAS_THAT_VOUCH: None})
     report = {"empty_fraction": 0.85, "image_price_db": -1e-4, "lost_surface_mass": 2.05e-4}
     (line,) = price_in_words(report)

@@ -104,7 +104,7 @@ def test_it_renders_what_asking_about_everything_renders(
     with torch.no_grad():
         whole = shade(scene, rays, everything, freeze_gate=True)
     seen, asked = shade_front_to_back(scene, rays, everything)
-    assert len(asked.t_starts) == len(seen.weights) == len(seen.logits) == len(seen.routes)
+    assert len(asked.t_starts) == len(seen.weights) == len(seen.routes)
     torch.testing.assert_close(seen.rgb, whole.rgb, atol=HARDLY, rtol=0.0)
     torch.testing.assert_close(seen.accumulation, whole.accumulation, atol=HARDLY, rtol=0.0)
     torch.testing.assert_close(seen.depth, whole.depth, atol=2.5 * HARDLY, rtol=0.0)
@@ -232,17 +232,32 @@ def test_c_asks_and_answers_as_torch_does(
     monkeypatch.setenv(VARIABLE, "native")
     theirs, expected = shade_front_to_back(*given)
     assert {0, 1} <= set(ours.routes.tolist()) <= {0, 1, 3}
-    best = ours.logits[:, 1:].topk(2).values
+    best = theirs.logits[:, 1:].topk(2).values
     # between equal experts, and at the threshold, rounding chooses
     tied = (best[:, 0] - best[:, 1] < 1e-4) | (
-        (occupancy_from_logits(ours.logits) - middle).abs() < 1e-5
+        (occupancy_from_logits(theirs.logits) - middle).abs() < 1e-5
     )
     clear = torch.ones(150, dtype=torch.bool)
     clear[asked[0][tied]] = False
     assert clear.sum() > 140
+    theirs = theirs._replace(logits=ours.logits)  # C gives none
     for one, other in zip((*asked, *ours), (*expected, *theirs), strict=True):
         chosen = clear if len(one) == len(clear) else clear[asked[0]]
         torch.testing.assert_close(one[chosen], other[chosen], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.usefixtures("by")
+@torch.no_grad()
+def test_what_is_kept_is_the_only_expert_s_and_the_gate_is_not_asked() -> None:
+    scene, rays = scene_of(3.0), some_rays(40)
+    scene.gate.head.bias[0], scene.gate.head.bias[1] = -20.0, 20.0  # else it would say so itself
+    asked = shade_front_to_back(scene, rays, kept_along(rays))
+    scene.gate.hidden[0].bias[0] = torch.nan
+    kept = shade_front_to_back(scene._replace(kept=True), rays, kept_along(rays))
+    assert torch.equal(kept[0].routes, torch.ones_like(kept[0].routes)) and kept[0].rgb.sum() > 0.0
+    for one, other in zip((*asked[1], *asked[0]), (*kept[1], *kept[0]), strict=True):
+        if other.shape != (len(kept[0].routes), 0):
+            torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
 
 
 @needs_compiler

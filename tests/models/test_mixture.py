@@ -8,6 +8,7 @@ import pytest
 import torch
 from small_learner import SMALLEST, small_mixture
 
+from leco_plugin.models.gate import Gate
 from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.space import SpaceKind
 
@@ -26,6 +27,30 @@ def test_learning_marches_as_coarsely_as_it_has_fewer_candidates(kind: SpaceKind
     up, none = torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, dtype=torch.int64)
     past = mixture.rays(9.0 * up, up, none)  # what is left of a ray that misses: a fine step
     assert float(past.t_maxs - past.t_mins) == pytest.approx(steps[0], rel=1e-4)
+
+
+def test_where_a_gate_skips_the_only_scene_expert_has_all_that_is_kept() -> None:
+    alone = replace(SMALLEST, gate=replace(SMALLEST.gate, scene_experts=1))
+    mixture = small_mixture(alone)
+    learning = mixture.scene()
+    assert mixture.scene(kept=True) == learning and learning.gate is mixture.gate
+    mixture.freeze(0.05, {})
+    assert mixture.scene(kept=True).kept
+    assert mixture.scene().routing.empty_below == pytest.approx(0.05)  # what is skipped is empty
+    mixture.freeze(0.6, {})
+    assert mixture.scene() == learning  # which is what the field has learned with
+    small = Gate(replace(SMALLEST.gate, scene_experts=1))
+    mixture.sharpen(small, 0.1, {})
+    assert mixture.scene().gate is small and not mixture.scene().kept
+    mixture.freeze(0.0, {})
+    assert mixture.scene(kept=True) == learning  # all is kept, also what is empty
+
+
+def test_a_frozen_gate_goes_on_routing_to_several_scene_experts() -> None:
+    mixture = small_mixture()
+    learning = mixture.scene()
+    mixture.freeze(0.1, {})
+    assert mixture.scene() == mixture.scene(kept=True) == learning
 
 
 def test_a_gate_of_more_experts_than_its_field_is_refused() -> None:

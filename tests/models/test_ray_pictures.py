@@ -31,12 +31,12 @@ INTERVALS = Intervals(
 """Three samples and a backdrop; a backdrop alone; one sample alone; nothing; haze before one."""
 WEIGHTS = torch.tensor([0.3, 0.25, 0.25, 0.2, 1.0, 0.5, 0.01, 0.99])
 ROUTES = torch.tensor([1, 3, 3, 2, 2, 0, 1, 1])
-OCCUPANCIES = torch.tensor([0.5, 1.0, 1.0, 0.0, 0.9, 0.2, 0.9, 0.9])
+OCCUPANCIES = torch.tensor([0.8, 0.9, 0.2, 0.7, 0.9])
+"""Where each ray ends."""
 
 
 def rendering() -> Shaded:
-    logits = torch.zeros(8, EXPERTS)
-    logits[:, 0] = torch.log((1.0 - OCCUPANCIES).clamp(min=1e-9) / OCCUPANCIES.clamp(min=1e-9) * 3)
+    logits = torch.zeros(8, 0)  # nobody asked
     counts = torch.tensor([4, 1, 1, 0, 2])
     packed_info = torch.stack([counts.cumsum(0) - counts, counts], dim=-1)
     sums = torch.tensor([1.0, 1.0, 0.5, 0.0, 1.0])
@@ -48,7 +48,7 @@ def rendering() -> Shaded:
 def pictures() -> dict[str, Tensor]:
     met, shown = before_the_backdrop(rendering(), INTERVALS, RAYS)
     assert backdrop_of(INTERVALS, RAYS).nonzero().flatten().tolist() == [3, 4, 7]
-    return shown | gate_pictures(met, INTERVALS.ray_indices)
+    return shown | gate_pictures(met, INTERVALS.ray_indices, OCCUPANCIES, EXPERTS)
 
 
 def column(picture: Tensor) -> list[float]:
@@ -64,7 +64,7 @@ def test_a_backdrop_is_transparent_and_as_far_as_nothing() -> None:
 
 
 def test_occupancy_is_that_of_what_is_met() -> None:
-    assert column(pictures()["occupancy"]) == [(0.15 + 0.5) / 0.8, 0.0, 0.2, 0.0, 0.0]
+    assert column(pictures()["occupancy"]) == [0.8, 0.0, 0.2, 0.0, 0.0]
 
 
 def test_the_expert_is_the_one_with_the_greatest_weight_and_no_mean_of_numbers() -> None:

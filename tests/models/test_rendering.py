@@ -104,7 +104,9 @@ def test_there_may_be_no_rays_and_no_samples(routing: Routing, rays: int, kept: 
     if not kept:
         assert not bool(shaded.rgb.any()) and torch.equal(shaded.depth, batch.t_maxs)
     met, shown = before_the_backdrop(shaded, intervals, batch)
-    for picture in (shown | gate_pictures(met, intervals.ray_indices)).values():
+    experts = shaded.logits.shape[-1]
+    of_gate = gate_pictures(met, intervals.ray_indices, torch.rand(rays), experts)
+    for picture in (shown | of_gate).values():
         assert picture.shape == (rays, 1) and picture.dtype == torch.float32
         assert bool(picture.isfinite().all())
     (shaded.rgb.sum() + shaded.depth.sum() + shaded.accumulation.sum()).backward()

@@ -21,7 +21,8 @@ typedef struct {
     const float *const *gate, *const *field, *const *color;
     const uint8_t *left; /* scene experts that were not dropped */
     float epsilon, half_extent, empty_odds;
-    int octaves, fresh, gate_layers, gate_width, outputs;
+    int octaves, fresh, gate_layers, gate_width;
+    int outputs; /* of the gate; 0 does not ask it, and the first scene expert has all samples */
     int levels, log2, features, width, layers, units, unbounded;
 } Scene;
 
@@ -34,7 +35,7 @@ typedef struct {
     float *rgb, *accumulation, *distance;               /* [rays, ...], zero at first */
     int64_t *asked;                                     /* [rays], zero at first: of samples */
     int64_t *ray_indices, *routes;                      /* [samples], as all that follow */
-    float *t_starts, *t_ends, *weights, *sigmas, *logits;
+    float *t_starts, *t_ends, *weights, *sigmas;
     float least_light, visible, opaque, faint;
     int at_once;
 } Batch;
@@ -104,12 +105,16 @@ static void ask(const Scene *scene, const Batch *batch, Chunk *chunk, int begin,
 {
     for (int i = begin; i < end; i++)
         place(scene, batch, chunk, i);
-    gate_logits(chunk->mapped[0], scene->scales, scene->gate, chunk->logits, begin, end, CHUNK, 1,
-                scene->octaves, scene->fresh, scene->gate_layers, scene->gate_width,
-                scene->outputs, scene->epsilon);
-    for (int i = begin; i < end; i++)
-        route(scene, chunk, i);
-    sort_by_route(chunk, begin, end, scene->outputs);
+    if (scene->outputs) {
+        gate_logits(chunk->mapped[0], scene->scales, scene->gate, chunk->logits, begin, end, CHUNK,
+                    1, scene->octaves, scene->fresh, scene->gate_layers, scene->gate_width,
+                    scene->outputs, scene->epsilon);
+        for (int i = begin; i < end; i++)
+            route(scene, chunk, i);
+        sort_by_route(chunk, begin, end, scene->outputs);
+    } else
+        for (int i = begin; i < end; i++)
+            chunk->routes[i] = 1, chunk->factors[i] = 1.0f, chunk->order[i] = i;
     hash_sums(chunk->unit[0], scene->resolutions, scene->table, chunk->encoded, begin, end,
               scene->levels, scene->log2, scene->features, 4);
     field_densities(chunk->encoded, chunk->order, chunk->routes, chunk->factors, scene->field,
@@ -169,7 +174,7 @@ static void ask_next(const Scene *scene, const Batch *batch, Chunk *chunk, Front
 }
 
 /* Weighs a sample of a ray, number i of the chunk, and notes whether it is seen. */
-static int weigh(const Scene *scene, const Batch *batch, Chunk *chunk, Front *front, int i, int seen)
+static int weigh(const Batch *batch, Chunk *chunk, Front *front, int i, int seen)
 {
     int64_t sample = chunk->samples[i], ray = front->ray;
     int64_t to = batch->starts[ray] + batch->asked[ray]++;
@@ -183,27 +188,23 @@ static int weigh(const Scene *scene, const Batch *batch, Chunk *chunk, Front *fr
     batch->weights[to] = chunk->weights[i] = weight;
     batch->sigmas[to] = chunk->sigmas[i];
     batch->routes[to] = chunk->routes[i];
-    memcpy(batch->logits + to * scene->outputs, chunk->logits + (int64_t)i * scene->outputs,
-           scene->outputs * sizeof(float));
     if (weight > batch->visible)
         chunk->seen[seen++] = i;
     return seen;
 }
 
 /* Moves what was asked of rays `begin` to `end` together, to where those rays begin. */
-static int64_t pack(const Scene *scene, const Batch *batch, int64_t begin, int64_t end)
+static int64_t pack(const Batch *batch, int64_t begin, int64_t end)
 {
     int64_t first = begin < end ? batch->starts[begin] : 0, to = first;
     for (int64_t ray = begin; ray < end; ray++) {
         int64_t from = batch->starts[ray], count = batch->asked[ray];
-#define MOVE(OUT, SIZE)                                                                            \
-    memmove(batch->OUT + to * (SIZE), batch->OUT + from * (SIZE), count * (SIZE) * sizeof *batch->OUT)
-        MOVE(t_starts, 1);
-        MOVE(t_ends, 1);
-        MOVE(weights, 1);
-        MOVE(sigmas, 1);
-        MOVE(routes, 1);
-        MOVE(logits, scene->outputs);
+#define MOVE(OUT) memmove(batch->OUT + to, batch->OUT + from, count * sizeof *batch->OUT)
+        MOVE(t_starts);
+        MOVE(t_ends);
+        MOVE(weights);
+        MOVE(sigmas);
+        MOVE(routes);
         for (int64_t i = to; i < to + count; i++)
             batch->ray_indices[i] = ray;
         to += count;
@@ -238,7 +239,7 @@ int64_t front_to_back(const Scene *scene, const Batch *batch, int64_t begin, int
             int *places = chunk->places + f * batch->at_once, length = length_of(batch, &front);
             for (int k = 0; k < length; k++)
                 if (places[k] != NOT_ASKED)
-                    seen = weigh(scene, batch, chunk, &front, places[k], seen);
+                    seen = weigh(batch, chunk, &front, places[k], seen);
             front.next += length;
             if (front.next < front.last && front.light >= batch->least_light)
                 fronts[left++] = front;
@@ -248,5 +249,5 @@ int64_t front_to_back(const Scene *scene, const Batch *batch, int64_t begin, int
                    scene->color, batch->rgb, scene->width, scene->units);
     }
     free(chunk), free(fronts);
-    return pack(scene, batch, begin, end);
+    return pack(batch, begin, end);
 }
