@@ -30,6 +30,7 @@ from leco_plugin.models.rendering import backdrop_of, mapped_middles
 from leco_plugin.occupancy import CALIBRATED_AT, Occupancy
 from leco_plugin.scenes.city.city import DESCRIPTION
 from leco_plugin.scenes.city.folder import CityTruth
+from leco_plugin.seen import CELLS, cells_at
 from leco_plugin.scenes.learning_data import held_out_rays
 
 CALIBRATION = CalibrationConfig()
@@ -39,8 +40,6 @@ VOLUME_POINTS = 1 << 17
 """Positions drawn in the whole box, of which rays reach some."""
 TAUGHT_RAYS = 1 << 15
 """Rays of photographs that say what is reached, and of whose densities grids hear."""
-CELLS = 64
-"""Along an axis of the mapped cube: a cell is reached if it holds a candidate of those rays."""
 MOST_ON_CPU = 2e8
 """Densities evaluated for one grid: about three minutes of two cores."""
 SPARED = 0.1
@@ -225,15 +224,10 @@ def reached_volume(mixture: Mixture, taught: Tensor, count: int, seed: int = 0) 
 
 
 def is_reached(taught: Tensor, mapped: Tensor) -> Tensor:
-    """Which mapped positions [P, 3] share a cell with one of `taught` [M, 3]: bool [P]."""
-
-    def cells(places: Tensor) -> Tensor:
-        i, j, k = ((places + 1.0) * (CELLS / 2)).long().clamp(0, CELLS - 1).unbind(dim=-1)
-        return (i * CELLS + j) * CELLS + k
-
+    """Which mapped positions [P, 3] share a cell of seen space with `taught` ones [M, 3]: [P]."""
     found = torch.zeros(CELLS**3, dtype=torch.bool, device=taught.device)
-    found[cells(taught)] = True
-    return found[cells(mapped)]
+    found[cells_at(taught)] = True
+    return found[cells_at(mapped)]
 
 
 def rays_of_photographs(datamanager: Any, count: int) -> RayBundle:
