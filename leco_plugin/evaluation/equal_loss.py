@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,8 +29,8 @@ from leco_plugin.models.rendering import backdrop_of, mapped_middles
 from leco_plugin.occupancy import CALIBRATED_AT, Occupancy
 from leco_plugin.scenes.city.city import DESCRIPTION
 from leco_plugin.scenes.city.folder import CityTruth
-from leco_plugin.seen import CELLS, cells_at
 from leco_plugin.scenes.learning_data import held_out_rays
+from leco_plugin.seen import CELLS, cells_at
 
 CALIBRATION = CalibrationConfig()
 LOST_SURFACE_MASS = 1e-3
@@ -176,21 +175,22 @@ def _kept_by_grids(
     and the resolutions for which there is no memory or no time."""
     rows, left_out = [], []
 
+    def density(mapped: Tensor) -> Tensor:
+        return in_parts(lambda part: mixture.answers(part).sigmas, mapped)
+
     def floor_of(scores: Tensor) -> float:
         of_rays = field_grids.look_up_scores(scores, ground.box, ground.mapped)
         return threshold_losing(ground.weights, of_rays, SPARED * LOST_SURFACE_MASS)
 
     most = MOST_ON_CPU if mixture.device.type == "cpu" else math.inf
-    density = partial(field_grids.density_of, mixture)
-    filling = field_grids.FieldGrids(density, ground.box, (taught, density(taught)), floor_of, most)
-    for n in resolutions:
-        scores = filling.fill(n) if field_grids.fits_memory(n**3) else None
+    known = taught, density(taught)
+    grids = field_grids.fill_grids(density, ground.box, known, resolutions, floor_of, most)
+    for n, (scores, seconds) in zip(resolutions, grids):
         if scores is None:
             left_out.append(n)
             continue
-        size = {"resolution": n, "bytes": math.ceil(n**3 / 8)}
-        seconds = round(filling.clock.seconds, 3)
-        rows.append({**size, "update_seconds": seconds, **ground.kept_by_score(scores)})
+        size = {"resolution": n, "bytes": math.ceil(n**3 / 8), "update_seconds": round(seconds, 3)}
+        rows.append({**size, **ground.kept_by_score(scores)})
     return rows, left_out
 
 

@@ -7,17 +7,15 @@ out. The time for 512^3 cells therefore depends on how much surface they hold.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from torch import Tensor
 from torch.nn.functional import max_pool3d, pad
 
 from leco_plugin.evaluation.clock import Clock
-from leco_plugin.evaluation.inspection import ViewBox, in_parts
+from leco_plugin.evaluation.inspection import ViewBox
 from leco_plugin.models.compute.device import free_memory
-from leco_plugin.models.mixture import Mixture
 from leco_plugin.samplers.boxes import cells_of
 
 FEWEST_PROBES, PROBES_ALONG = 8, 2048
@@ -31,38 +29,41 @@ Density = Callable[[Tensor], Tensor]
 """Of mapped positions [N, 3]: [N]."""
 
 
-@dataclass
-class FieldGrids:
-    """Grids of one field in a box of mapped coordinates, from coarse to fine."""
+def fill_grids(
+    density: Density,
+    box: ViewBox,
+    known: tuple[Tensor, Tensor] | None,
+    resolutions: Sequence[int],
+    floor_of: Callable[[Tensor], float],
+    most: float = math.inf,
+) -> Iterator[tuple[Tensor | None, float]]:
+    """Grids of one field in a box of mapped coordinates: for each of `resolutions`, cells along an
+    axis, its scores [n, n, n] and the seconds that it took, those of the grids that it was refined
+    from included. A grid is refined from the one before if that is half as fine; else all of its
+    cells are asked.
 
-    density: Density
-    box: ViewBox
-    known: tuple[Tensor, Tensor] | None
-    """Mapped positions [M, 3] and densities [M] that count too: hundreds of random places miss a
-    surface that fills a thousandth of a cell."""
-    floor_of: Callable[[Tensor], float]
-    """For the scores [n, n, n] of a grid, the one below which a cell and its neighbours are empty
-    in finer grids too."""
-    most: float = math.inf
-    """Densities that may be evaluated for one grid."""
-    scores: Tensor | None = None
-    floor: float = 0.0
-    clock: Clock = field(default_factory=Clock)
-    """The time of the last grid, including those that it was refined from."""
-
-    def fill(self, cells: int) -> Tensor | None:
-        """Scores [n, n, n] of a grid with n = `cells` along each axis; None where it would ask more
-        than `most`. The grid filled before is refined if it is half as fine; else all cells are
-        asked."""
-        if self.scores is not None and 2 * len(self.scores) != cells:
-            self.scores, self.clock = None, Clock()
-        with self.clock.running():
-            asked = cells_to_ask(cells, self.scores, self.floor, self.box.low.device)
-            if int(asked.sum()) * probes_in_a_cell(cells) > self.most:
-                return None
-            self.scores = fill_cells(self.density, self.box, asked, known=self.known)
-            self.floor = self.floor_of(self.scores)
-        return self.scores
+    Args:
+        known: mapped positions [M, 3] and densities [M] that count too: hundreds of random places
+            miss a surface that fills a thousandth of a cell.
+        floor_of: for the scores of a grid, the one below which a cell and its neighbours are empty
+            in finer grids too.
+        most: densities that may be evaluated for one grid. Of one that asks more, or does not fit
+            the free memory, the scores are None.
+    """
+    scores, floor, clock = None, 0.0, Clock()
+    for n in resolutions:
+        if not fits_memory(n**3):
+            yield None, 0.0
+            continue
+        if scores is not None and 2 * len(scores) != n:
+            scores, clock = None, Clock()
+        with clock.running():
+            asked = cells_to_ask(n, scores, floor, box.low.device)
+            may_ask = int(asked.sum()) * probes_in_a_cell(n) <= most
+            if may_ask:
+                scores = fill_cells(density, box, asked, known=known)
+                floor = floor_of(scores)
+        yield scores if may_ask else None, clock.seconds
 
 
 def cells_to_ask(
@@ -148,8 +149,3 @@ def fits_memory(cells: int) -> bool:
     """Whether a grid of so many cells can be filled in half of the memory that is free."""
     free = free_memory()
     return free is None or BYTES_A_CELL * cells < free / 2
-
-
-def density_of(mixture: Mixture, mapped: Tensor) -> Tensor:
-    """Density of a mixture's field at mapped positions [N, 3], per half extent: [N]."""
-    return in_parts(lambda part: mixture.answers(part).sigmas, mapped)

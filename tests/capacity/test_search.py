@@ -35,8 +35,7 @@ from leco_plugin.capacity.search import (
 )
 from leco_plugin.capacity.shrink import check_losses
 from leco_plugin.capacity.sources import Source
-from leco_plugin.evaluation.field_grids import in_parts
-from leco_plugin.evaluation.inspection import whole_box
+from leco_plugin.evaluation.inspection import in_parts, whole_box
 from leco_plugin.models.encodings import EncodingConfig
 from leco_plugin.models.gate import Gate, GateConfig, check_sizes
 from leco_plugin.occupancy import Occupancy

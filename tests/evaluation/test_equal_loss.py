@@ -156,14 +156,14 @@ def test_a_tenth_of_the_loss_may_lie_in_what_finer_grids_leave_out(
     """Of four layers of cells the first three hold 5e-5, 5e-4 and the rest of the weight."""
     floors = []
 
-    def grids(density: object, box: object, known: object, floor_of: Any, most: float) -> Any:
+    def grids(density: object, box: object, known: object, sizes: object, floor_of: Any, _: float):
         floors.append(floor_of(torch.arange(1.0, 5.0).repeat_interleave(16).view(4, 4, 4)))
-        return SimpleNamespace(fill=lambda cells: None)
+        return [(None, 0.0)]
 
     places = torch.tensor([[-0.4, 0.0, 0.0], [-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]])
     weights = torch.tensor([5e-5, 5e-4, 1.0])
     monkeypatch.setattr(equal_loss, "_measured", lambda *_: (places, weights, torch.ones(3)))
-    monkeypatch.setattr(equal_loss.field_grids, "FieldGrids", grids)
+    monkeypatch.setattr(equal_loss.field_grids, "fill_grids", grids)
     at_equal_loss(mixture, None, grids=(4,))
     assert floors == [2.0]
 

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from leco_plugin.evaluation import clock, field_grids
 from leco_plugin.evaluation.field_grids import (
-    FieldGrids,
     cells_to_ask,
     fill_cells,
+    fill_grids,
     fits_memory,
     look_up_scores,
     octree_bytes,
@@ -130,12 +130,13 @@ def test_a_grid_serves_the_next_one_only_if_that_is_twice_as_fine() -> None:
         return ball(mapped)
 
     def questions(*resolutions: int) -> int:
-        grids = FieldGrids(counted, BOX, None, lambda scores: 0.5)
-        for n in resolutions:
-            before = sum(asked)
-            scores = grids.fill(n)
-        assert scores.shape == (n,) * 3 and grids.clock.seconds > 0.0
-        return sum(asked) - before
+        before, grids = [sum(asked)], []
+        for grid in fill_grids(counted, BOX, None, resolutions, lambda scores: 0.5):
+            before.append(sum(asked))
+            grids.append(grid)
+        scores, seconds = grids[-1]
+        assert scores is not None and scores.shape == resolutions[-1:] * 3 and seconds > 0.0
+        return before[-1] - before[-2]
 
     assert questions(16, 32) < questions(32) == questions(12, 32)
 
@@ -151,17 +152,16 @@ def test_the_time_of_a_grid_is_that_of_the_coarser_ones_too(
         return torch.zeros(len(mapped))
 
     monkeypatch.setattr(clock, "seconds_now", lambda: asked[0])
-    grids = FieldGrids(density, BOX, None, lambda scores: 0.0)
-    for cells, seconds in ((16, 128.0), (32, 128.0 + 64.0), (12, 170.0)):
-        assert grids.fill(cells) is not None and grids.clock.seconds == seconds
+    grids = fill_grids(density, BOX, None, (16, 32, 12), lambda scores: 0.0)
+    assert [seconds for _, seconds in grids] == [128.0, 128.0 + 64.0, 170.0]
     assert [field_grids.probes_in_a_cell(n) for n in (128, 256, 300, 512)] == [16, 8, 8, 8]
 
 
 def test_a_grid_that_asks_more_than_it_may_is_filled_only_from_a_coarser_one() -> None:
     most = 32**3 * 64 - 1
-    assert FieldGrids(ball, BOX, None, lambda scores: 0.5, most).fill(FINE) is None
-    grids = FieldGrids(ball, BOX, None, lambda scores: 0.5, most)
-    assert grids.fill(CUBE) is not None and grids.fill(FINE) is not None
+    for resolutions, are_filled in (((FINE,), [False]), ((CUBE, FINE), [True, True])):
+        grids = fill_grids(ball, BOX, None, resolutions, lambda scores: 0.5, most)
+        assert [scores is not None for scores, _ in grids] == are_filled
 
 
 def node_bytes(kept: Tensor) -> int:
