@@ -73,14 +73,6 @@ class Reference(NamedTuple):
     guided: bool = True
     """Whether the original guides the rendering, and so loses nothing more in it."""
 
-    def loss_of(self, part: Part, skipped: Tensor | None, unlikely: float) -> Loss:
-        """What is lost in all where candidates [M] of a part are skipped; None is none of them."""
-        share = bound = lost_mass = 0.0
-        if skipped is not None:
-            share, bound, lost_mass = loss(part.evidence, skipped, unlikely)
-        lost = self.lost_before
-        return Loss(lost + share, lost + bound, self.mass_before + lost_mass)
-
 
 class Ground(NamedTuple):
     """What gates are taught and measured on."""
@@ -115,8 +107,12 @@ class Ground(NamedTuple):
         `unlikely`. `scores` are those of the gate, where they are known."""
         found = []
         for one, score in zip(self.references, scores or self.scores(gate, side)):
-            skipped = None if score is None else score < gate.threshold
-            found.append(one.loss_of(getattr(one, side), skipped, unlikely))
+            share = bound = mass = 0.0
+            if score is not None:
+                evidence = getattr(one, side).evidence
+                share, bound, mass = loss(evidence, score < gate.threshold, unlikely)
+            lost = one.lost_before
+            found.append(Loss(lost + share, lost + bound, one.mass_before + mass))
         return found
 
     def price(self, gate: Occupancy, side: str) -> float | None:
