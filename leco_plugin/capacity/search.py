@@ -161,10 +161,10 @@ def search(
     """Walks up the ladder, `gates` by size or all that are smaller than the original, and stops at
     the first that is within the bounds on unseen rays. `on_rung` gets each gate that was tried,
     `on_progress` the share of the ladder that is done."""
-    gates = ladder(values_of(ground.original.gate.config)) if gates is None else gates
-    volume = spread_positions(ground.original, VOLUME_POINTS, seed=5)
-    kept = kept_of_box(ground.original)
-    lesson = lesson_of(ground.original, ground.taught)
+    original = ground.original
+    gates = ladder(values_of(original.gate.config)) if gates is None else gates
+    volume, kept = spread_positions(original), kept_of_box(original)
+    lesson = lesson_of(original, ground.taught)
     rungs: list[Rung] = []
     looks = 0
     for number, config in enumerate(gates):
@@ -175,7 +175,9 @@ def search(
             def show_part(share: float, first: float = first, last: float = last) -> None:
                 on_progress(first + share * (last - first))
 
-            gate = _teach_in_place(config, lesson, times * STEPS, ground.original, show_part)
+            steps, precision = times * STEPS, original.precision
+            taught = teach(config, lesson, steps, precision, on_progress=show_part)
+            gate = original.with_gate(taught, 0.5, {}).eval()  # no threshold of its own yet
             rung, gate = _measure(ground, gate, bounds, volume, kept, looks + 1)
             looks = rung.look or looks
             nearly = rung.lost_surface_mass <= NEARLY * MARGIN * bounds.lost_surface_mass
@@ -188,20 +190,6 @@ def search(
         if rung.verdict == "chosen":
             return Found(gate, rungs)
     return Found(None, rungs)
-
-
-def _teach_in_place(
-    config: GateConfig,
-    lesson: Lesson,
-    steps: int,
-    original: Occupancy,
-    on_progress: Callable[[float], None],
-) -> Occupancy:
-    """A gate in the original's place, without a threshold of its own yet."""
-    gate = teach(config, lesson, steps, original.precision, on_progress=on_progress)
-    said = (0.5, original.precision, None)
-    smaller = Occupancy(gate, original.space, *said, original.walls, original.seen)
-    return smaller.to(original.threshold_value.device).eval()
 
 
 def lesson_of(original: Occupancy, taught: Evidence) -> Lesson:
@@ -290,11 +278,11 @@ def find_threshold(scores: Tensor, share: float) -> float:
 
 def kept_of_box(occupancy: Occupancy) -> float:
     """Share of an occupancy's box, or of a contracted cube, that it keeps."""
-    places = spread_positions(occupancy, VOLUME_POINTS, seed=5)
-    return float((in_parts(occupancy.query, places) >= occupancy.threshold).double().mean())
+    values = in_parts(occupancy.query, spread_positions(occupancy))
+    return float((values >= occupancy.threshold).double().mean())
 
 
-def spread_positions(occupancy: Occupancy, count: int, seed: int) -> Tensor:
+def spread_positions(occupancy: Occupancy, count: int = VOLUME_POINTS, seed: int = 5) -> Tensor:
     """Positions [count, 3] spread evenly over the occupancy's box, or over a contracted cube."""
     device = occupancy.threshold_value.device
     if occupancy.space.kind == "contraction":

@@ -125,14 +125,14 @@ def test_a_search_that_is_stopped_leaves_the_gates_that_it_tried(
 ) -> None:
     smallest = [GateConfig(EncodingConfig(octaves=2), width, 1, 1) for width in (1, 2)]
     monkeypatch.setattr(search, "ladder", lambda most: smallest)
-    real = search._teach_in_place
+    real = search.teach
 
-    def stopped_at_the_second(config: GateConfig, *some: object) -> Occupancy:
+    def stopped_at_the_second(config: GateConfig, *some: Any, **more: Any) -> Gate:
         if config is smallest[1]:
             raise KeyboardInterrupt
-        return real(config, *some)
+        return real(config, *some, **more)
 
-    monkeypatch.setattr(search, "_teach_in_place", stopped_at_the_second)
+    monkeypatch.setattr(search, "teach", stopped_at_the_second)
     out, report = tmp_path / "small", tmp_path / "small.json"
     assert run("shrink", ball, "--data", tiny_scene, "--out", out, "--json", report) == 130
     known = json.loads(report.read_text())
