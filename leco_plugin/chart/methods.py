@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from leco_plugin.chart.contender import (
@@ -115,8 +116,8 @@ def contenders(methods: Sequence[str], samplers: Sequence[str] = ()) -> list[Con
     found: dict[str, Contender] = {}
     unused = dict.fromkeys(samplers)
     for method in dict.fromkeys(methods):
-        usual, allowed = _samplers_of(method)
-        fitting = {name: _contender_of(method, name) for name in samplers or usual}
+        usual, allowed, contender_with = _choices_of(method)
+        fitting = {name: contender_with(name) for name in samplers or usual}
         made = {name: one for name, one in fitting.items() if one is not None}
         if not made:
             raise InputError(
@@ -136,38 +137,32 @@ def _name_and_cells(sampler: str) -> tuple[str, int | None]:
     return (sized[1], int(sized[2])) if sized else (sampler, None)
 
 
-def _samplers_of(method: str) -> tuple[list[str], str]:
-    """The usual samplers of a method, and all of them in words."""
-    if method in VARIANTS:
-        return [VARIANTS[method].sampler], VARIANTS[method].sampler
-    model = _model_of(method)
-    if isinstance(model, LecoModelConfig):
-        kinds = [name for name, spec in registered_samplers().items() if spec.needs_occupancy]
-        return [LEARNED], ", ".join([*kinds, DENSE])
-    every = ", ".join([*registered_samplers(), OWN_SAMPLER, LONG_STEPS, WITHOUT_GIFTS])
-    is_guided = isinstance(model, GuidedModelConfig)
-    return [LEARNED, OWN_SAMPLER, LONG_STEPS] if is_guided else [OWN_SAMPLER], every
-
-
-def _model_of(method: str) -> Any:
+def _choices_of(method: str) -> tuple[list[str], str, Callable[[str], Contender | None]]:
+    """The usual samplers of a method, all of them in words, and what makes a contender with one:
+    None where the method cannot use it."""
     from nerfstudio.configs.method_configs import all_methods
 
+    if method in VARIANTS:
+        one = VARIANTS[method]
+        return [one.sampler], one.sampler, {one.sampler: one}.get
     try:
-        return registered(method).pipeline.model
+        model: Any = registered(method).pipeline.model
     except InputError as error:
         if method in all_methods:
             raise
         raise InputError(f"{error}; and for charts {', '.join(VARIANTS)}") from None
+    if isinstance(model, LecoModelConfig):
+        kinds = [name for name, spec in registered_samplers().items() if spec.needs_occupancy]
+        return [LEARNED], ", ".join([*kinds, DENSE]), partial(_contender_that_learns, method)
+    every = ", ".join([*registered_samplers(), OWN_SAMPLER, LONG_STEPS, WITHOUT_GIFTS])
+    if not isinstance(model, GuidedModelConfig):
+        return [OWN_SAMPLER], every, partial(contender_of_host, method, host=model)
+    usual = [LEARNED, OWN_SAMPLER, LONG_STEPS]
+    return usual, every, partial(contender_of_host, method, host=model.host)
 
 
-def _contender_of(method: str, sampler: str) -> Contender | None:
-    """A method with a sampler; None where the method cannot use it."""
-    if method in VARIANTS:
-        return VARIANTS[method] if VARIANTS[method].sampler == sampler else None
-    model = _model_of(method)
-    if not isinstance(model, LecoModelConfig):
-        host = model.host if isinstance(model, GuidedModelConfig) else model
-        return contender_of_host(method, sampler, host)
+def _contender_that_learns(method: str, sampler: str) -> Contender | None:
+    """A method that learns its occupancy itself, with a sampler."""
     called = METHOD_NAMES.get(method, method)
     if sampler == DENSE:
         return replace(NEVER_FROZEN, name=f"{called}, never frozen", method=method)
