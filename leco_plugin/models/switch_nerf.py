@@ -11,6 +11,7 @@ from nerfstudio.model_components.renderers import RGBRenderer
 from nerfstudio.models.base_model import Model
 from torch import Tensor, nn
 
+from leco_plugin.log import summarize
 from leco_plugin.models.compute.device import fast_precision, keep_freed_memory
 from leco_plugin.models.figures import image_figures, leading_expert, over_background, with_alpha
 from leco_plugin.models.losses import require_finite
@@ -38,7 +39,7 @@ from leco_plugin.samplers.base import densities_of_samples
 from leco_plugin.samplers.grid import OccupancyGridEstimator
 from leco_plugin.scenes.bounds import SceneBounds
 from leco_plugin.scenes.learning_data import LearningData
-from leco_plugin.scenes.survey import announce, places_of
+from leco_plugin.scenes.survey import places_of
 from leco_plugin.space import Space
 from leco_plugin.studio.checkpoints import prepare_checkpoints
 
@@ -118,7 +119,7 @@ class SwitchNerfModel(Model):
             data = LearningData(training_callback_attributes.pipeline.datamanager, *asked)
             self.set_bounds(data.survey.bounds, data.survey.median_length)
             self.region.note_backdrops(*data.covering_rays())
-            announce(data.survey)
+            summarize(data.survey.summary(), data.survey.lines())
         before = callbacks.TrainingCallbackLocation.BEFORE_TRAIN_ITERATION
         return [callbacks.TrainingCallback([before], self.update_estimator)]
 

@@ -12,7 +12,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from leco_plugin.log import first_of, summarize
+from leco_plugin.log import first_of
 from leco_plugin.models.objective import DARK
 from leco_plugin.samplers.boxes import intersect_box
 from leco_plugin.scenes.bounds import (
@@ -171,11 +171,6 @@ def lengths_inside(bounds: SceneBounds, origins: Tensor, directions: Tensor) -> 
     """Lengths [N] of rays [N, 3] inside bounds, at most 0 of those that miss them."""
     enters, leaves = intersect_box(origins, directions, bounds.aabb)
     return leaves.clamp(max=bounds.far) - enters.clamp(min=bounds.near)
-
-
-def announce(found: Survey) -> None:
-    """Says in the log where the scene lies."""
-    summarize(found.summary(), found.lines())
 
 
 def chosen_cameras(count: int, most: int = MOST_CAMERAS) -> Tensor:

@@ -13,6 +13,7 @@ from scene_files import refused, write_ply
 from tiny_scene import camera_to_world
 from torch import Tensor
 
+from leco_plugin.log import summarize
 from leco_plugin.scenes.bounds import BoundsConfig
 from leco_plugin.scenes.city.cameras import CaptureConfig
 from leco_plugin.scenes.city.city import CityConfig
@@ -24,7 +25,6 @@ from leco_plugin.scenes.photographs import LecoPhotographsDataParserConfig
 from leco_plugin.scenes.survey import (
     MOST_CAMERAS,
     SIDE,
-    announce,
     bright,
     covering_rays,
     lengths_inside,
@@ -248,7 +248,7 @@ def test_every_line_reaches_the_log(monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
     monkeypatch.setattr("leco_plugin.log.note", said.append)
     found = survey(datamanager(drone(), ground()))
-    announce(found)
+    summarize(found.summary(), found.lines())
     assert said == found.lines()
 
 
