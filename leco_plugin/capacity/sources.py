@@ -25,12 +25,9 @@ from leco_plugin.models.rendering import Rays
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.frames import between, found_again, frame_of, moved, turned
 from leco_plugin.scenes.input_error import InputError, one_line, require_folder
-from leco_plugin.scenes.pixels.held_out_pixels import (
-    held_out_sampler,
-    some_images,
-    visible_in_test,
-)
+from leco_plugin.scenes.pixels.held_out_pixels import SOME, held_out_sampler, visible_in_test
 from leco_plugin.scenes.pixels.known_distances import batches_of
+from leco_plugin.scenes.survey import chosen_cameras
 from leco_plugin.studio.checkpoints import step_of, whole_of
 
 DRAWS = 8
@@ -204,14 +201,12 @@ def draw_test_rays(source: Source, occupancy: Occupancy, count: int) -> Seen | N
     dataset = source.manager.eval_dataset
     if dataset is None or len(dataset) == 0:
         return None
-    images = some_images(dataset)
-    generator = torch.Generator().manual_seed(4)
-    each = -(-count // len(images["image"]))
+    chosen, generator = chosen_cameras(len(dataset), SOME), torch.Generator().manual_seed(4)
+    each = -(-count // len(chosen))
     indices, truths = [], []
-    for place, (number, image) in enumerate(zip(images["image_idx"].tolist(), images["image"])):
-        data: dict[str, Any] = {
-            key: images[key][place] for key in ("image", "mask") if key in images
-        }
+    for number in chosen.tolist():
+        data = dataset.get_data(number)
+        image = data["image"]
         pixels = (torch.rand(each, 2, generator=generator) * torch.tensor(image.shape[:2])).long()
         pixels = pixels[visible_in_test(source.manager, number, data, pixels)]
         indices.append(torch.nn.functional.pad(pixels, (1, 0), value=number))
