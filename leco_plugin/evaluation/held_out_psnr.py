@@ -13,7 +13,7 @@ from torch import Tensor
 
 from leco_plugin.evaluation.metrics import psnr, spread_evenly
 from leco_plugin.learning.dense import evaluating
-from leco_plugin.learning.quality import doubts_of_field, psnr_of_one_colour
+from leco_plugin.learning.quality import psnr_of_one_colour
 from leco_plugin.log import note
 from leco_plugin.scenes.learning_data import held_out_bundle
 from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler, visible_in_test
@@ -140,7 +140,3 @@ class HeldOutPsnr:
                 rays = cameras.generate_rays(camera_indices=number, coords=pixels + 0.5)
                 found.append((rays, image[tuple(pixels.T)]))
         return self._psnr_of(found) if found else None
-
-    def doubts(self, reached: float | None) -> list[str]:
-        """Two lines where a PSNR is hardly above that of one colour for all of its pixels."""
-        return [] if reached is None else doubts_of_field(reached, self.of_one_colour)

@@ -28,7 +28,7 @@ from leco_plugin.evaluation.held_out_psnr import OF, HeldOutPsnr
 from leco_plugin.evaluation.inspection import describe, doubts
 from leco_plugin.evaluation.metrics import FigureUnavailable
 from leco_plugin.learning.freezing import FILE_NAME, leave_file
-from leco_plugin.learning.quality import AT_END, FIELD, ONE_COLOUR
+from leco_plugin.learning.quality import AT_END, FIELD, ONE_COLOUR, doubts_of_field
 from leco_plugin.log import Show, bar, counted, details_in, on_screen, say, say_all, spell
 from leco_plugin.models.compute.ranks import is_first
 from leco_plugin.occupancy import Occupancy
@@ -171,8 +171,8 @@ class RunProgress:
         last = self.psnr.latest if tested is None else tested
         if occupancy.exists():
             say_all(doubts(describe(at_end(occupancy, last, self.psnr.of_one_colour))))
-        else:
-            say_all(self.psnr.doubts(last))
+        elif last is not None:
+            say_all(doubts_of_field(last, self.psnr.of_one_colour))
         say(f"  run        {folder}")
         if occupancy.exists():
             say(f"  occupancy  {occupancy}, {occupancy.stat().st_size / 1e3:.0f} kB")
