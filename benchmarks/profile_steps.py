@@ -36,7 +36,7 @@ from leco_plugin.evaluation.report import (
     made_by,
     read_object,
 )
-from leco_plugin.evaluation.timed_run import RAYS_AT_ONCE, run_training, set_up
+from leco_plugin.evaluation.timed_run import RAYS_AT_ONCE, set_up
 from leco_plugin.learning.schedule import steps_in
 from leco_plugin.models import front_to_back, rendering
 from leco_plugin.models.compute.device import fast_precision
@@ -44,6 +44,7 @@ from leco_plugin.models.gate import Gate
 from leco_plugin.models.leco import LecoModel
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.whole_files import write_json
+from leco_plugin.studio.host_models import run_training
 
 COPIED, SIDE = 1 << 26, 2048
 """float32 that are copied, and side of the matrices that are multiplied, to measure the machine."""

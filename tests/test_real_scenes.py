@@ -13,7 +13,6 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-from leco_plugin.evaluation.timed_run import run_training
 from leco_plugin.host_configs import switch_nerf
 from leco_plugin.learning.calibration import CalibrationConfig
 from leco_plugin.learning.dense import evaluating
@@ -21,6 +20,7 @@ from leco_plugin.learning.freezing import FILE_NAME
 from leco_plugin.method_configs import leco_occupancy
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.learning_data import held_out_bundle
+from leco_plugin.studio.host_models import run_training
 
 pytestmark = [pytest.mark.scenes, pytest.mark.slow]
 

@@ -36,7 +36,7 @@ from leco_plugin.learning.schedule import rate_at
 from leco_plugin.on_cpu import in_float64
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.pixels.held_out_pixels import visible_in_test
-from leco_plugin.studio.host_models import leave_out_the_end, true_colours
+from leco_plugin.studio.host_models import run_training, true_colours
 from leco_plugin.studio.run_folder import ENDLESS
 
 RAYS_AT_ONCE = 1024
@@ -302,12 +302,6 @@ class _Course:
         elif self.run.steps == TIMED_STEPS:
             more = left / statistics.fmean(self.step_times[FIRST_TIMED:])
             keep_within(progress, more, self.run.steps)
-
-
-def run_training(trainer: Trainer) -> None:
-    """nerfstudio's training loop, without the last checkpoint and its banner."""
-    leave_out_the_end(trainer)
-    trainer.train()
 
 
 def psnr_on_rays(trainer: Trainer, rays: int) -> float:

@@ -53,7 +53,8 @@ def outputs_of(dataset: Any) -> Any:
     return dataset._dataparser_outputs
 
 
-def leave_out_the_end(trainer: Any) -> None:
-    """Has a trainer end after its last step, without a last checkpoint, a banner and a viewer,
-    which no option of `TrainerConfig` turns off together."""
+def run_training(trainer: Any) -> None:
+    """nerfstudio's training loop, which ends after its last step: without a last checkpoint, a
+    banner and a viewer, which no option of `TrainerConfig` turns off together."""
     trainer._after_train = lambda: None
+    trainer.train()

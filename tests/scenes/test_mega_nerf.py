@@ -161,9 +161,10 @@ def test_nerfstudio_never_draws_a_pixel_of_a_right_half(scene: Path) -> None:
 
 
 def test_leco_occupancy_trains_on_it_without_a_flag(scene: Path, tmp_path: Path) -> None:
-    from leco_plugin.evaluation.timed_run import psnr_on_rays, run_training
+    from leco_plugin.evaluation.timed_run import psnr_on_rays
     from leco_plugin.learning.calibration import CalibrationConfig
     from leco_plugin.method_configs import leco_occupancy
+    from leco_plugin.studio.host_models import run_training
 
     config = copy.deepcopy(leco_occupancy.config)
     config.pipeline.datamanager.dataparser = MegaNerfDataParserConfig(data=scene)
