@@ -4,9 +4,9 @@ photographs that they are compared with."""
 from __future__ import annotations
 
 import math
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
-from unittest.mock import patch
 
 from torch import Tensor, nn
 
@@ -31,12 +31,18 @@ class LazyLpipsNetwork(nn.Module):
         return metric.to(first.device).net(first, second, **options)
 
 
-def lazy_lpips() -> AbstractContextManager[Any]:
+@contextmanager
+def lazy_lpips() -> Iterator[None]:
     """While this lasts, every `LearnedPerceptualImagePatchSimilarity` that is made loads lazily:
     its network's class is exchanged, which reaches hosts that imported the metric long before."""
     from torchmetrics.image import lpip
 
-    return patch.object(lpip, "_NoTrainLpips", LazyLpipsNetwork)
+    eager_network = lpip._NoTrainLpips
+    lpip._NoTrainLpips = LazyLpipsNetwork  # type: ignore[assignment, misc]
+    try:
+        yield
+    finally:
+        lpip._NoTrainLpips = eager_network  # type: ignore[misc]
 
 
 def true_colours(host: Any, image: Tensor) -> Tensor:
