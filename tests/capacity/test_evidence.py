@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 from ball_occupancy import CENTRE, ball
 
-from leco_plugin.capacity.evidence import UNLIKELY, Evidence, gather, join, loss, unlikely_at
+from leco_plugin.capacity.evidence import (
+    UNLIKELY,
+    Evidence,
+    Rendered,
+    gather,
+    image_price,
+    join,
+    loss,
+    unlikely_at,
+)
 from leco_plugin.capacity.sources import Seen
-from leco_plugin.models.rendering import Rays
+from leco_plugin.models.rendering import Intervals, Rays
 from leco_plugin.occupancy import Occupancy
 
 
@@ -138,3 +149,25 @@ def test_without_a_field_what_is_kept_is_worth_its_occupancy(cone_angle: float |
     outside = loss(found, found.kept & (found.positions[:, 2] > CENTRE[2]))
     if cone_angle is None:
         assert outside.share == pytest.approx(0.5, abs=0.05)  # the upper half of the ball
+
+
+def test_the_price_of_an_image_is_of_what_both_keep_and_of_every_backdrop() -> None:
+    """Each interval adds the colour at which it begins. The smaller gate keeps what begins before
+    0.25, and no backdrop lies there."""
+    starts = torch.tensor([0.2, 0.3, 0.5, 0.3, 0.6])  # of two rays, backdrops last
+    intervals = Intervals(torch.tensor([0, 0, 0, 1, 1]), starts, starts)
+    before_backdrop = torch.tensor([True, True, False, True, False])
+
+    def shade(rays: Rays, some: Intervals) -> SimpleNamespace:
+        rgb = torch.zeros(len(rays.origins)).index_add_(0, some.ray_indices, some.t_starts)
+        return SimpleNamespace(rgb=rgb[:, None].expand(-1, 3))
+
+    down = torch.tensor([[0.0, 0.0, -1.0]]).expand(2, 3)
+    rays = Rays(torch.zeros(2, 3), down, torch.zeros(2), torch.ones(2), None)
+    known: Any = SimpleNamespace(shade=shade)
+    smaller: Any = SimpleNamespace(occupied=lambda positions: positions[:, 2] > -0.25)
+    truth = torch.tensor([[0.9], [0.9]]).expand(2, 3)
+    one = Rendered(rays, intervals, before_backdrop, shade(rays, intervals).rgb, truth)
+    # 1.0 and 0.9 with all of them; 0.7 and 0.6 without those that begin at 0.3
+    expected = 10.0 * math.log10((0.2**2 + 0.3**2) / 0.1**2)
+    assert image_price(known, [one, one], smaller) == pytest.approx(expected, abs=1e-3)

@@ -265,12 +265,14 @@ def test_a_run_with_grids_serves_a_chart_without_them(chart: Charts, tmp_path: P
     assert again.runs == [("ours", 0), ("ours", 1)]
 
 
-def test_the_occupancy_of_a_run_comes_with_it(chart: Charts, tmp_path: Path) -> None:
+def test_the_occupancy_and_the_picture_of_a_run_come_with_it(chart: Charts, tmp_path: Path) -> None:
     make(chart("a", contenders=[PLAIN], seeds=(0,)))
-    name = Job(PLAIN, 0).name
-    (tmp_path / "a" / RUNS / f"{name}.safetensors").write_bytes(b"gate")
+    files = [f"{Job(PLAIN, 0).name}{ending}" for ending in (".safetensors", ".png")]
+    for file in files:
+        (tmp_path / "a" / RUNS / file).write_bytes(file.encode())
     make(chart("b", contenders=[PLAIN], seeds=(0,), reuse=[tmp_path / "a"]))
-    assert (tmp_path / "b" / RUNS / f"{name}.safetensors").read_bytes() == b"gate"
+    for file in files:
+        assert (tmp_path / "b" / RUNS / file).read_bytes() == file.encode()
 
 
 def test_a_chart_with_other_settings_gives_no_runs(chart: Charts, tmp_path: Path) -> None:
