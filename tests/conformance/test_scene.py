@@ -81,6 +81,19 @@ def test_a_chord_ends_where_the_slab_does_to_a_hundredth():
 
 
 @pytest.mark.parametrize(
+    ("ray", "t", "is_covered"),
+    [
+        *((0, 0.5, False), (0, 1.5, True), (0, 2.5, False), (0, 3.5, True), (0, 4.5, False)),
+        *((1, 0.5, False), (1, 1.5, False), (1, 2.5, True), (1, 3.5, False)),
+    ],
+)
+def test_a_place_is_covered_between_the_ends_of_a_sample_of_its_own_ray(ray, t, is_covered):
+    starts, ends = torch.tensor([3.0, 2.0, 1.0]), torch.tensor([4.0, 3.0, 2.0])
+    samples = torch.tensor([0, 1, 0]), starts, ends  # in no order
+    assert scene.covered(torch.tensor([ray]), torch.tensor([t]), samples).tolist() == [is_covered]
+
+
+@pytest.mark.parametrize(
     ("edges", "problem"),
     [
         ([(1.0, 1.1), (1.5, 1.6), (1.94, 2.04)], None),  # its middle is before the far end

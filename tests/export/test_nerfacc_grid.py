@@ -96,6 +96,8 @@ def test_slabs_do_not_change_the_grid(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_unbounded_scene_gets_levels_as_far_as_its_rays() -> None:
     far = unbounded(far=3.0, cameras=[[CENTRE[0] + 0.2, CENTRE[1], CENTRE[2]]])
     assert reaching_levels(far) == 4  # 0.4, 0.8, 1.6, 3.2
+    farther = unbounded(far=3.0, cameras=[[CENTRE[0], CENTRE[1], CENTRE[2] - 0.3]])
+    assert reaching_levels(farther) == 5  # 3.3 is beyond 3.2
     assert grid_buffers(far, 4)["binaries"].shape == (4, 4, 4, 4)
     assert reaching_levels(unbounded()) == 8
     with pytest.raises(ValueError, match="unbounded") as error:

@@ -17,6 +17,7 @@ from ball_occupancy import CENTRE, HALF, RADIUS, WALLS, ball
 from scene_files import change, described, refused
 from scipy.spatial.transform import Rotation
 
+from leco_plugin import cli
 from leco_plugin.chart.theme import new_figure, save_picture
 from leco_plugin.evaluation import inspection
 from leco_plugin.evaluation.occupancy_picture import draw
@@ -210,6 +211,21 @@ def test_a_folder_has_everything_and_says_what_each_part_is_for(
     assert said.count(f" {points['points']:,} points on the surface of what is kept") == 2
     assert points["points"] + splats["sparse_points"] == splats["points"]
     assert f" and {splats['sparse_points']:,} sparse points that are kept, in splats.ply" in said
+
+
+@pytest.mark.parametrize("format", [None, "ply"])
+def test_the_command_takes_colours_from_the_scene_that_is_named(
+    format: str | None, file: Path, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("draw", "write_page"):  # seconds
+        monkeypatch.setattr(f"leco_plugin.export.{name}", lambda *_, **__: None)
+    out, report = tmp_path / "out", tmp_path / "out.json"
+    asked = ["export", file, "--out", out, "--json", report, "--data", scene, "--resolution", 16]
+    asked += [] if format is None else ["--format", format]
+    assert cli.main(list(map(str, asked))) == 0
+    facts = json.loads(report.read_text())
+    points = facts["parts"]["kept.ply"] if format is None else facts
+    assert points["photograph_colours"] and points["resolution"] == 16
 
 
 def test_a_part_that_cannot_be_made_is_one_line_and_the_others_are_written(
