@@ -145,8 +145,8 @@ def dense_reference(mixture: Mixture, rays: Rays) -> Reference:
     """All candidates of some rays rendered, as the reference that skipping is measured against."""
     intervals = mixture.with_backdrops(rays, mixture.candidates(rays))
     reference = reference_of(mixture.shade(rays, intervals), intervals, rays)
-    if mixture.small is None:
-        return reference
+    if mixture.small is None or mixture.scene().gate is mixture.small:
+        return reference  # the gate that skips has answered
     mapped = mapped_middles(mixture.region.space, rays, intervals)
     return reference._replace(occupancies=mixture.occupancies(mapped))
 
