@@ -52,6 +52,7 @@ from leco_plugin.occupancy import Occupancy
 from leco_plugin.samplers.grid import OccupancyGridEstimator
 from leco_plugin.scenes.coloured_points import coloured_points, colours_near, georeference
 from leco_plugin.scenes.frames import moved
+from leco_plugin.scenes.input_error import one_line
 from leco_plugin.scenes.whole_files import check_apart, check_place, write_whole
 
 Format = Literal["ply", "splat-init", "npz", "nerfacc-grid"]
@@ -352,7 +353,7 @@ def _part(folder: Path, name: str, write: Callable[[], Facts], use: Callable[[Fa
         facts = write()
     except (ValueError, OSError) as error:
         older = "; the older one is left" if (folder / name).exists() else ""
-        return Part(name, None, f"{error}{older}")
+        return Part(name, None, f"{one_line(error)}{older}")
     return Part(name, facts, use(facts))
 
 

@@ -89,7 +89,7 @@ def leave_field(mixture: Mixture, folder: Path | None) -> None:
         return
     try:
         write_whole(folder / FIELD_FILE, lambda file: torch.save(mixture.state_dict(), file))
-    except (OSError, RuntimeError) as error:  # as which torch reports a disk that is full
+    except OSError as error:
         say(f"{folder / FIELD_FILE} could not be written ({error}); the run goes on without it")
 
 

@@ -54,7 +54,10 @@ def require_folder(path: Path, remedy: str) -> None:
 
 def one_line(error: BaseException, most: int | None = None) -> str:
     """What an error says, in one line of at most so many characters; empty if it says nothing."""
-    return " ".join(str(error).split())[:most]
+    said = str(error)
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        said = f"{error.strerror}: {error.filename}"
+    return " ".join(said.split())[:most]
 
 
 def first_line(error: BaseException) -> str:

@@ -30,16 +30,33 @@ FETCH = "is a pointer of Git LFS: `git lfs pull` fetches the file"
 
 def write_whole(path: Path, content: bytes | Callable[[BinaryIO], object]) -> None:
     """Writes bytes, or what a function writes into a file, beside `path` and moves it there;
-    folders are made. Of several processes at once the last one wins."""
+    folders are made. Of several processes at once the last one wins. OSError, which names the
+    file, if it cannot be written, or something that is no file has its name."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    if kind := _other_than_a_file(path):
+        raise OSError(f"{path} is {kind}; give a file")
     known = f"{path.name[-LONGEST:]}.{os.getpid()}-{threading.get_ident()}"
     part = path.with_name(f".{known}{PART}")
     try:
         with part.open("wb") as file:
             file.write(content) if isinstance(content, bytes) else content(file)
         part.replace(path)
+    except (OSError, RuntimeError) as error:
+        # torch tells of a full disk by an error of its own
+        cause = error if isinstance(error, OSError) else error.__context__
+        if not isinstance(cause, OSError) or cause.errno is None:
+            raise
+        raise OSError(cause.errno, cause.strerror, str(path)) from None
     finally:
         part.unlink(missing_ok=True)
+
+
+def _other_than_a_file(path: Path) -> str | None:
+    """What has the name of a file to write and is none; None where nothing has."""
+    is_device = path.parent == Path("/dev")  # a file would take its place
+    if not is_device and (path.is_file() or not path.exists()):
+        return None
+    return "a folder" if path.is_dir() else "a device or a pipe"
 
 
 def digest_of_file(path: Path, *more: str) -> str:
@@ -105,9 +122,7 @@ def check_place(option: str, path: Path | None) -> None:
     no new file. Tries it with a file that has no name, as rights do not say all."""
     if path is None:
         return
-    is_device = path.parent == Path("/dev")  # a file would take its place
-    if is_device or (path.exists() and not path.is_file()):
-        kind = "a folder" if path.is_dir() else "a device or a pipe"
+    if kind := _other_than_a_file(path):
         raise InputError(f"{option} {path} is {kind}; give a file")
     nearest = next(folder for folder in path.absolute().parents if folder.exists())
     if not nearest.is_dir():

@@ -2,16 +2,20 @@
 
 import os
 from collections.abc import Callable
+from io import FileIO
 from pathlib import Path
 from threading import Thread
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
+import numpy as np
 import pytest
+import torch
 from scene_files import refused
 
 from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.occupancy import Occupancy
 from leco_plugin.scenes.coloured_points import read_cloud
+from leco_plugin.scenes.input_error import one_line
 from leco_plugin.scenes.photograph_files import header_of
 from leco_plugin.scenes.pt_file import read_pt
 from leco_plugin.scenes.whole_files import PART, alone_in, check_place, remove_parts, write_whole
@@ -45,11 +49,31 @@ def test_a_failure_leaves_the_old_file_and_no_part(tmp_path: Path) -> None:
     assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("file", b"old")]
 
 
-def test_a_report_takes_the_place_of_no_device_and_no_pipe(tmp_path: Path) -> None:
+def test_a_file_takes_the_place_of_no_folder_no_device_and_no_pipe(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OSError, match=f"^{tmp_path / 'pipe'} is a device or a pipe; give a file$"):
+        write_whole(tmp_path / "pipe", b"")
+    with pytest.raises(OSError, match=f"^{tmp_path} is a folder; give a file$"):
+        Occupancy(Gate(GateConfig()), Space(), 0.5).save(tmp_path)
+    assert (tmp_path / "pipe").is_fifo()
     for path in (Path("/dev/stdout"), tmp_path / "pipe"):
         with refused(f"^--json {path} is a device or a pipe; give a file$"):
             check_place("--json", path)
+
+
+@pytest.mark.parametrize("save", [np.save, lambda file, values: torch.save(values, file)])
+def test_a_disk_that_is_full_is_said_with_the_file(
+    save: Callable[[Any, Any], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Full(FileIO):
+        def write(self, _: Any) -> int:
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "open", lambda path, _: Full(path, "w"))
+    with pytest.raises(OSError) as caught:
+        write_whole(tmp_path / "file", lambda file: save(file, torch.zeros(9)))
+    assert one_line(caught.value) == f"No space left on device: {tmp_path / 'file'}"
+    assert not [*tmp_path.iterdir()]
 
 
 def test_parts_of_killed_processes_are_found_at_any_depth(tmp_path: Path) -> None:
