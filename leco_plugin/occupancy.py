@@ -86,9 +86,11 @@ class Occupancy(nn.Module):
         self.space = space
         self.precision: Precision = precision
         self.report = dict(report or {})
-        self.register_buffer("threshold_value", torch.tensor(float(threshold)))
+        # in float32 as in a file, whatever torch's default type is
+        tau = torch.tensor(float(threshold), dtype=torch.float32)
+        self.register_buffer("threshold_value", tau)
         self.seen = SeenSpace() if seen is None else seen
-        everywhere = torch.tensor([-NO_WALL] * 3 + [NO_WALL] * 3)
+        everywhere = torch.tensor([-NO_WALL] * 3 + [NO_WALL] * 3, dtype=torch.float32)
         self.register_buffer("walls", everywhere if walls is None else walls.detach().clone())
 
     @property

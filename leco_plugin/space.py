@@ -67,8 +67,8 @@ class Space(nn.Module):
         half_extent: float = 1.0,
     ) -> None:
         super().__init__()
-        self.register_buffer("center", torch.zeros(3))
-        self.register_buffer("half_extent", torch.ones(()))
+        self.register_buffer("center", torch.zeros(3, dtype=torch.float32))
+        self.register_buffer("half_extent", torch.ones((), dtype=torch.float32))
         self.register_buffer("unbounded", torch.zeros((), dtype=torch.bool))
         self.set(kind, torch.tensor(center), half_extent)
 

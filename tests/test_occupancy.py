@@ -104,12 +104,14 @@ def test_a_file_is_read_in_float32_whatever_torchs_default_is(default, tmp_path:
     positions = torch.randn(100, 3)
     torch.set_default_dtype(default)
     try:
-        loaded = Occupancy.load(tmp_path / "occupancy.safetensors")
+        loaded = Occupancy.load(tmp_path / "occupancy.safetensors").with_threshold(0.3)
         values = loaded.query(positions)
+        loaded.save(tmp_path / "again.safetensors")
     finally:
         torch.set_default_dtype(torch.float32)
     floating = [value for value in loaded.state_dict().values() if value.is_floating_point()]
     assert {value.dtype for value in floating} == {torch.float32}
+    assert Occupancy.load(tmp_path / "again.safetensors").threshold == loaded.threshold
     assert values.equal(saved.query(positions))
 
 

@@ -63,7 +63,8 @@ def intersect_box(origins: Tensor, directions: Tensor, aabb: Tensor) -> tuple[Te
 def cell_centers(aabbs: Tensor, resolution: Tensor) -> Tensor:
     """Centres of the cells of boxes [n_boxes, 6], z fastest, [n_boxes * cells, 3]; `resolution` has
     the cells along each axis, int [3]."""
-    axes = [(torch.arange(cells, device=aabbs.device) + 0.5) / cells for cells in resolution]
+    kind, device = aabbs.dtype, aabbs.device
+    axes = [(torch.arange(n, dtype=kind, device=device) + 0.5) / n for n in resolution.tolist()]
     units = torch.cartesian_prod(*axes)
     low, high = aabbs[:, None, :3], aabbs[:, None, 3:]
     return (low + units * (high - low)).view(-1, 3)

@@ -203,7 +203,7 @@ def places_by_column_in_runs(wanted: Tensor) -> tuple[Tensor, Tensor]:
     some = wanted.view(torch.uint8).unflatten(0, (-1, RUN)).amax(dim=1)
     columns, runs = by_column(some)
     first = torch.add(columns, runs, alpha=RUN * m)
-    places = (first[:, None] + torch.arange(RUN) * m).view(-1)
+    places = (first[:, None] + torch.arange(RUN, device=first.device) * m).view(-1)
     chosen = wanted.view(-1).index_select(0, places).nonzero()[:, 0]
     return columns.index_select(0, chosen >> RUN_BITS), places.index_select(0, chosen)
 

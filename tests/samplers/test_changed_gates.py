@@ -171,12 +171,17 @@ def test_to_see_that_nothing_has_changed_waits_for_no_device():
     assert waits.seen == []
 
 
-def test_torchs_default_type_changes_no_cell(built):
-    asked = ball()
+def test_torchs_default_type_changes_no_cell_and_no_sample(built):
+    asked, rays = ball(), crossing()
+
+    def told() -> list[torch.Tensor]:
+        estimator = LearnedOccupancyEstimator(asked, cache_bytes=BUDGET)
+        return [*estimator.sampling(*rays[:2], render_step_size=0.05), estimator.occs]
+
     torch.set_default_dtype(torch.float64)
     try:
-        LearnedOccupancyEstimator(asked, cache_bytes=BUDGET)
+        found = told()
     finally:
         torch.set_default_dtype(torch.float32)
-    LearnedOccupancyEstimator(asked, cache_bytes=BUDGET)
+    assert all(map(torch.equal, found, told()))
     assert all(map(torch.equal, *(cache.tables() for cache in built)))

@@ -291,7 +291,8 @@ def _numbers(samples: Samples, step_size: float) -> Tensor:
 
 def _places(weights: GateWeights, count: int) -> Tensor:
     """Positions in the gate's cube and a little beyond, [count, 3]; always the same ones."""
-    unit = torch.rand(count, 3, generator=torch.Generator().manual_seed(0)) * 2.4 - 1.2
+    generator = torch.Generator("cpu").manual_seed(0)
+    unit = torch.rand(count, 3, device="cpu", generator=generator) * 2.4 - 1.2
     return weights.facts[:3] + weights.facts[3] * unit.to(weights.facts)
 
 

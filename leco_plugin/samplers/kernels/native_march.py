@@ -54,11 +54,12 @@ def _march(cache: CellCache, candidates: Candidates) -> tuple[Samples, Tensor]:
     room = candidates.counts.long()
     total = int(room.sum())
     numbers, powers = candidates.for_kernels()
+    new = candidates.t_mins.new_empty  # whatever torch's default type and device are
     samples = {
-        "ray_indices": torch.empty(total, dtype=torch.int64),
-        "t_starts": torch.empty(total),
-        "t_ends": torch.empty(total),
-        "open": torch.empty(total, dtype=torch.bool),
+        "ray_indices": new(total, dtype=torch.int64),
+        "t_starts": new(total),
+        "t_ends": new(total),
+        "open": new(total, dtype=torch.bool),
     }
     coarse, bricks, first_plane, planes, clearance = cache.held
     rooms = room.cumsum(0) - room
