@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from leco_plugin.hosts.seams import replace_module
 from leco_plugin.log import say
-from leco_plugin.models.field import APPEARANCE_SCALE, codes_nearby
+from leco_plugin.models.field import APPEARANCE_SCALE, codes_nearby, viewpoints
 
 Codes = Literal["small", "own"]
 """How a host's codes begin: at zero and scaled down, or as the host has them."""
@@ -109,7 +109,7 @@ def _drawn_at_random(host: Model, count: Any) -> list[str]:
 def show_from(host: nn.Module, origins: Tensor | None) -> None:
     """Tells the codes of a host from where rays [..., 3] of a view begin; None in training, where
     each ray has a photograph."""
+    views = None if origins is None else viewpoints(origins.reshape(-1, 3))
     for codes in host.modules():
         if isinstance(codes, SmallCodes):
-            views = None if origins is None else origins.reshape(-1, 3).unique(dim=0)
             codes.origin = views if views is not None and len(views) == 1 else None
