@@ -105,7 +105,8 @@ def taught_by(source: Source, mixture: Mixture) -> dict[str, Any]:
             mixture,
             taught,
             (held_out.rays, on_black(held_out.truth)),
-            [],  # no photograph vouches: test rays say what a new view loses
+            [],  # no photograph vouches: other test rays say what a new view loses
+            [],
             losses,
             calibration,
             SharpeningConfig(),

@@ -35,7 +35,7 @@ STEPS = 30_000 if ON_GPU else 4_000
 LEARNING = LecoModelConfig(
     sizes=automatic(sizes_for(best_device())),
     schedule=ScheduleConfig(learn_steps=2_000 if ON_GPU else 200, learn_share=0.1),
-    eval_num_rays_per_chunk=1 << 15 if ON_GPU else 1 << 12,
+    eval_num_rays_per_chunk=1 << 15 if ON_GPU else 1 << 13,
 )
 """The HMoE in sizes of this device, smaller where the scene is."""
 

@@ -44,6 +44,10 @@ that loses more; 2.4% of sky is worth 11 dB."""
 CAMERAS_THAT_VOUCH = "cameras_that_vouch"
 """In a report: what whole photographs lose that taught it nothing, see `calibration.promise`."""
 
+TESTS_LOSE = "tests_lose"
+"""In a report: the share of its surfaces that each of some test photographs has lost so far, where
+a small gate is to follow."""
+
 CALIBRATED_AT = "calibrated_threshold"
 """In a report: the threshold that its figures are of, where a host has lowered it since."""
 

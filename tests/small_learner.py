@@ -59,6 +59,10 @@ class NoPixels:
         """No photograph."""
         return []
 
+    def of_tests(self, *_: Any) -> list[Any]:
+        """Nor any test photograph."""
+        return []
+
     def count_held_out(self, limit: int) -> float:
         """As if none were held out."""
         return math.inf

@@ -15,8 +15,8 @@ from leco_plugin.evaluation.metrics import psnr, spread_evenly
 from leco_plugin.learning.dense import evaluating
 from leco_plugin.learning.quality import psnr_of_one_colour
 from leco_plugin.log import note
-from leco_plugin.scenes.learning_data import held_out_bundle
-from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler, visible_in_test
+from leco_plugin.scenes.learning_data import bundles_of_tests, held_out_bundle
+from leco_plugin.scenes.pixels.held_out_pixels import held_out_sampler
 from leco_plugin.studio.host_models import true_colours
 
 FIRST_AFTER, BETWEEN = 8.0, 10.0
@@ -128,15 +128,5 @@ class HeldOutPsnr:
         if dataset is None or len(dataset) == 0:
             return None
         chosen = spread_evenly(len(dataset), TEST_PHOTOGRAPHS)
-        generator, cameras = torch.Generator().manual_seed(0), dataset.cameras.to("cpu")
-        found: list[tuple[RayBundle, Tensor]] = []
-        for number in chosen:
-            data = dataset.get_data(number)
-            image = data["image"]
-            places = torch.rand(FEWEST_LAST // len(chosen), 2, generator=generator)
-            pixels = (places * torch.tensor(image.shape[:2])).long()
-            pixels = pixels[visible_in_test(self.manager, number, data, pixels)]
-            if len(pixels) > 0:
-                rays = cameras.generate_rays(camera_indices=number, coords=pixels + 0.5)
-                found.append((rays, image[tuple(pixels.T)]))
+        found = [*bundles_of_tests(self.manager, chosen, FEWEST_LAST // len(chosen))]
         return self._psnr_of(found) if found else None

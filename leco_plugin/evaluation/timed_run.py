@@ -35,6 +35,7 @@ from leco_plugin.hosts.learn_first import FIRST_TIMED, TIMED_STEPS, keep_within
 from leco_plugin.learning.schedule import rate_at
 from leco_plugin.on_cpu import in_float64
 from leco_plugin.scenes.input_error import InputError
+from leco_plugin.scenes.learning_data import bundles_of_tests
 from leco_plugin.scenes.pixels.held_out_pixels import visible_in_test
 from leco_plugin.studio.host_models import run_training, true_colours
 from leco_plugin.studio.run_folder import ENDLESS
@@ -323,20 +324,10 @@ def errors_on_rays(trainer: Trainer, rays: int) -> list[float]:
     pipeline, manager = trainer.pipeline, trainer.pipeline.datamanager
     pipeline.eval()
     dataset: Any = manager.eval_dataset
-    generator = torch.Generator().manual_seed(0)
-    per_image = -(-rays // len(dataset))
-    cameras, errors = dataset.cameras.to("cpu"), []
-    for number in range(len(dataset)):
-        data = dataset.get_data(number)
-        image = data["image"]
-        drawn = [torch.randint(side, (per_image,), generator=generator) for side in image.shape[:2]]
-        pixels = torch.stack(drawn, dim=-1)
-        pixels = pixels[visible_in_test(manager, number, data, pixels)]
-        if len(pixels) == 0:
-            continue
-        bundle = cameras.generate_rays(camera_indices=number, coords=pixels + 0.5)
+    numbers, errors = range(len(dataset)), []
+    for bundle, colours in bundles_of_tests(manager, numbers, -(-rays // len(dataset))):
         rgb = render_rays(pipeline.model, bundle.to(pipeline.device), RAYS_AT_ONCE)
-        truth = true_colours(pipeline.model, image[tuple(pixels.T)].to(rgb.device))
+        truth = true_colours(pipeline.model, colours.to(rgb.device))
         errors.append(float(in_float64((rgb - truth) ** 2).mean()))
     pipeline.train()
     if not errors:

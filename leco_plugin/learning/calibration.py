@@ -142,40 +142,39 @@ NOTHING: Mapping[str, Any] = MappingProxyType({})
 """A report by which nothing was skipped so far."""
 
 
-def worst_loss(cameras: Sequence[Reference], threshold: float) -> float:
-    """The largest share of its weight near surfaces that any of some photographs, densely rendered,
-    loses by skipping below `threshold`; 0 of none. It never falls as the threshold rises."""
-    losses = [0.0]
+def lost_by_each(cameras: Sequence[Reference], threshold: float) -> list[float]:
+    """The share of its weight near surfaces that each of some photographs, densely rendered, loses
+    by skipping below `threshold`. None falls as the threshold rises."""
+    found = []
     for reference in cameras:
         surface = reference.surface_weights
         lost = float((surface * reference.skipped(threshold)).sum())
-        losses.append(lost / max(float(surface.sum()), 1e-12))
-    return float(torch.tensor(losses, dtype=torch.float64).max())  # NaN where any is
+        found.append(lost / max(float(surface.sum()), 1e-12))
+    return found
 
 
-def promise(
-    cameras: Sequence[Reference],
-    measured: Measured,
-    config: CalibrationConfig,
-    spent: Mapping[str, Any] = NOTHING,
-) -> Any:
-    """What a report says of photographs that vouch, as JSON values; None where none does.
-    `spent` is as of `calibrate`: what the worst of them has lost so far is added.
+def worst_of(lost: Sequence[float]) -> float:
+    """The largest of what `lost_by_each` gives; 0 of none."""
+    return float(torch.tensor([0.0, *lost], dtype=torch.float64).max())  # NaN where any is
+
+
+def promise(lost: Sequence[float], config: CalibrationConfig, taught: bool = False) -> Any:
+    """What a report says of photographs that vouch, by what each of them has lost, as JSON values;
+    None where none does.
 
     Were photographs drawn at random, another one would lose more than the worst of K with a chance
     of 1 in K + 1 at most, because a loss never falls as the threshold rises: split conformal
-    prediction, as in Angelopoulos et al., "Conformal Risk Control", 2022. A small gate they have
-    taught themselves: they say what they lose, and of other views nothing, with no confidence.
+    prediction, as in Angelopoulos et al., "Conformal Risk Control", 2022. Those that have `taught`
+    the gate say what they lose, and of other views nothing, with no confidence.
     """
-    if not cameras:
+    if not lost:
         return None
-    worst = worst_loss(cameras, measured.threshold) + _worst_so_far(spent)
-    confidence = round(len(cameras) / (len(cameras) + 1), 3)
+    worst, count = worst_of(lost), len(lost)
     return {
-        "count": len(cameras),
+        "count": count,
         "worst_surface_mass": worst,
         "bound": max(worst, config.camera_surface_mass),
-        "confidence": None if spent.get(CAMERAS_THAT_VOUCH) else confidence,
+        "confidence": None if taught else round(count / (count + 1), 3),
     }
 
 
@@ -189,7 +188,7 @@ def promise_below(report: Mapping[str, Any], threshold: float) -> dict[str, Any]
     return {CAMERAS_THAT_VOUCH: said | {"worst_surface_mass": 0.0, "bound": 0.0}}
 
 
-def _worst_so_far(spent: Mapping[str, Any]) -> float:
+def worst_so_far(spent: Mapping[str, Any]) -> float:
     """What the worst photograph that vouches has lost by a report; 0 where none is named."""
     return float((spent.get(CAMERAS_THAT_VOUCH) or {}).get("worst_surface_mass", 0.0))
 
@@ -334,15 +333,16 @@ def calibrate(
         below: only lower thresholds are tried.
         missed_only: as for `measure`.
         cameras: dense renderings of photographs that vouch. None of them may lose more than
-            `camera_surface_mass`, see `worst_loss`, as far as `MORE_KEPT` allows.
+            `camera_surface_mass`, see `lost_by_each`, as far as `MORE_KEPT` allows.
         spent: the report of what has skipped so far. Its costs are added to those measured, and
             both together are held to the bounds.
     """
-    best, earlier = None, _worst_so_far(spent)
+    best, earlier = None, worst_so_far(spent)
     if earlier > config.camera_surface_mass:
         earlier = 0.0  # no threshold did justice to that view; others are still looked after
     for threshold in thresholds_below(below):
-        beyond = not worst_loss(cameras, threshold) + earlier <= config.camera_surface_mass
+        worst = worst_of(lost_by_each(cameras, threshold)) + earlier
+        beyond = not worst <= config.camera_surface_mass
         if best is not None and beyond:
             continue
         if not missed_only:

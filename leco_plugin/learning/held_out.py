@@ -18,6 +18,7 @@ from leco_plugin.learning.calibration import (
     Measured,
     backdrop_price,
     calibrate,
+    lost_by_each,
     measure,
     promise,
     ray_prices,
@@ -30,7 +31,7 @@ from leco_plugin.learning.sharpening import Sharpened, SharpeningConfig, sharpen
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.rendering import Rays
-from leco_plugin.occupancy import BACKDROP_PRICE, CAMERAS_THAT_VOUCH
+from leco_plugin.occupancy import BACKDROP_PRICE, CAMERAS_THAT_VOUCH, TESTS_LOSE
 
 if TYPE_CHECKING:
     from leco_plugin.scenes.learning_data import LearningData
@@ -63,9 +64,14 @@ class HeldOut(PriceSource):
         """Rays cut to the region, and their colours [R, 3]; see `held_out_bundle`."""
         return self.data.held_out(self.mixture, count, seed, which)
 
-    def cameras(self) -> list[tuple[Rays, Tensor]]:
-        """Rays of each photograph that vouches, and their colours."""
+    def cameras(self) -> list[Rays]:
+        """Rays of each photograph that vouches."""
         return self.data.of_vouching(self.mixture, self.config.cameras, self.config.camera_rays)
+
+    def tests(self) -> list[Rays]:
+        """Rays of each of some test photographs, which neither teach nor choose a threshold: they
+        say what a new view loses to both a careful gate and the small one after it."""
+        return self.data.of_tests(self.mixture, self.config.cameras, self.config.camera_rays)
 
     @torch.no_grad()
     def price(self, careful: bool = False) -> tuple[Measured, Measured, dict[str, Any]]:
@@ -78,10 +84,11 @@ class HeldOut(PriceSource):
         """
         mixture, config = self.mixture, self.config
         rays, truth = self.rays(config.rays)
-        cameras = self.cameras()
         with evaluating(mixture):
             rendering = dense_rendering(mixture, rays, truth, config.rays_at_once)
-            of_cameras = [dense_reference(mixture, of_one) for of_one, _ in cameras]
+            of_cameras = [dense_reference(mixture, of_one) for of_one in self.cameras()]
+            tests = self.tests() if careful else []
+            of_tests = [dense_reference(mixture, of_one) for of_one in tests]
             measured = within = calibrate(rendering, config, cameras=of_cameras)
             if careful and within.threshold > 0.0:
                 lowest = THRESHOLDS[-1]  # else the watch had none to lower it to but 0
@@ -96,7 +103,7 @@ class HeldOut(PriceSource):
             FIELD: round(psnr(rendered.clamp(0.0, 1.0), truth), 3),
             ONE_COLOUR: round(psnr_of_one_colour(truth), 3),
             "calibration_rays": len(truth),
-            CAMERAS_THAT_VOUCH: promise(of_cameras, measured, config),
+            CAMERAS_THAT_VOUCH: promise(lost_by_each(of_cameras, measured.threshold), config),
             "near": float(region.near),
             "far": float(region.far),
             "step_size": rule.step_size,
@@ -104,6 +111,8 @@ class HeldOut(PriceSource):
             "aabb": region.aabb.tolist(),
             **self.data.facts(),
         }
+        if careful:
+            report[TESTS_LOSE] = lost_by_each(of_tests, measured.threshold)
         return measured, within, report
 
     @torch.no_grad()
@@ -138,8 +147,8 @@ class HeldOut(PriceSource):
     def sharpened(self, losses: GateLossConfig, config: SharpeningConfig) -> Sharpened | None:
         """A small gate that training pixels teach and these calibrate; see `sharpen`."""
         taught = self.data.training_rays(self.mixture, config.rays)
-        rays, cameras = self.rays(self.config.rays), self.cameras()
-        return sharpen(self.mixture, taught, rays, cameras, losses, self.config, config)
+        rays, views = self.rays(self.config.rays), (self.cameras(), self.tests())
+        return sharpen(self.mixture, taught, rays, *views, losses, self.config, config)
 
     def unneeded(self, count: int, bound: float) -> Merging:
         """Scene experts without which the image loses no more than `bound` dB."""

@@ -9,7 +9,7 @@ if it skips more. The large gate goes on routing.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
@@ -23,8 +23,10 @@ from leco_plugin.learning.calibration import (
     CalibrationConfig,
     Measured,
     calibrate,
+    lost_by_each,
     measure,
     promise,
+    worst_so_far,
 )
 from leco_plugin.learning.dense import (
     DenseRendering,
@@ -41,7 +43,7 @@ from leco_plugin.models.losses import widen
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.rendering import Intervals, Rays, backdrop_of, mapped_middles
-from leco_plugin.occupancy import CAMERAS_THAT_VOUCH, Precision, gate_precision
+from leco_plugin.occupancy import CAMERAS_THAT_VOUCH, TESTS_LOSE, Precision, gate_precision
 from leco_plugin.scenes.input_error import InputError, require
 
 BATCH = 1 << 11
@@ -155,8 +157,9 @@ class Sharpened(NamedTuple):
     before: Measured
     """The same of what has guided so far."""
     promised: dict[str, Any] | None
-    """What photographs that vouch say of it and of what has guided so far, see
-    `calibration.promise`."""
+    """What photographs say of it and of what has guided so far, see `calibration.promise`."""
+    tests_lose: Sequence[float] = ()
+    """What each of some test photographs loses to both; empty where that is not known."""
 
     @property
     def pays(self) -> bool:
@@ -183,7 +186,7 @@ class Sharpened(NamedTuple):
             learned: the gate that routes. It stays in the report, with what it did, as `learned`.
         """
         found = self.measured.on_top_of(before)._asdict()
-        found[CAMERAS_THAT_VOUCH] = self.promised  # of other photographs nothing is known
+        found |= {CAMERAS_THAT_VOUCH: self.promised, TESTS_LOSE: self.tests_lose}
         kept = {name: before[name] for name in ("threshold", "params", "empty_fraction", *LOSSES)}
         known = {"learned": {"gate": learned.to_dict(), **kept}}
         return known | before | found | {"params": self.params}
@@ -193,7 +196,8 @@ def sharpen(
     mixture: Mixture,
     taught: Rays,
     held_out: tuple[Rays, Tensor],
-    cameras: list[tuple[Rays, Tensor]],
+    cameras: list[Rays],
+    tests: list[Rays],
     losses: GateLossConfig,
     calibration: CalibrationConfig,
     config: SharpeningConfig,
@@ -207,7 +211,9 @@ def sharpen(
     Args:
         taught: training rays, cut to the region.
         held_out: rays that nothing was trained on, and their colours [R, 3].
-        cameras: the same of each photograph that vouches.
+        cameras: rays of each photograph that vouched for what has skipped so far; they lower the
+            threshold, and have trained the field.
+        tests: of each test photograph; they say what new views lose.
         losses: whose contribution loss teaches.
     """
     at_once = calibration.rays_at_once
@@ -220,14 +226,18 @@ def sharpen(
         before = measure(rendering, float(mixture.threshold))
         score = partial(mixture.occupancies, gate=gate)
         by_small = rescore_rendering(mixture, score, in_chunks(held_out[0], at_once), rendering)
-        of_cameras = [
-            _rescore(mixture, score, of_one, guided_reference(mixture, of_one))
-            for of_one, _ in cameras
-        ]
+        of_cameras, of_tests = (
+            [_rescore(mixture, score, rays, guided_reference(mixture, rays)) for rays in some]
+            for some in (cameras, tests)
+        )
         spent = mixture.report
         measured = calibrate(by_small, calibration, cameras=of_cameras, spent=spent)
-        promised = promise(of_cameras, measured, calibration, spent)
-        return Sharpened(gate, measured, before, promised)
+        lost = lost_by_each(of_cameras, measured.threshold)
+        promised = promise([worst_so_far(spent) + one for one in lost], calibration, taught=True)
+        pairs = zip(spent.get(TESTS_LOSE, ()), lost_by_each(of_tests, measured.threshold))
+        tests_lose = [sum(pair) for pair in pairs]
+        promised = promise(tests_lose, calibration) or promised
+        return Sharpened(gate, measured, before, promised, tests_lose)
 
 
 @torch.no_grad()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cached_property
 from typing import Any
 
@@ -11,6 +11,7 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
+from leco_plugin.evaluation.metrics import spread_evenly
 from leco_plugin.log import counted, say
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.region import SIDE, Region
@@ -23,6 +24,7 @@ from leco_plugin.scenes.pixels.held_out_pixels import (
     Share,
     held_out_sampler,
     some_images,
+    visible_in_test,
 )
 from leco_plugin.scenes.pixels.known_distances import (
     KnownDistancePixelSampler,
@@ -115,19 +117,30 @@ class LearningData:
             self._vouching[count] = numbers.long() if can else torch.zeros(0, dtype=torch.int64)
         return self._vouching[count]
 
-    def of_vouching(self, mixture: Mixture, count: int, of_each: int) -> list[tuple[Rays, Tensor]]:
-        """Rays of each photograph that vouches, and their colours; see `held_out_rays`."""
+    def of_vouching(self, mixture: Mixture, count: int, of_each: int) -> list[Rays]:
+        """Rays of each photograph that vouches, cut to a mixture's region."""
         sampler, chosen = held_out_sampler(self.manager), self.vouching(count)
         if sampler is None or not len(chosen):
             return []
         batch = sampler.sample_pictures(_images_of(self.manager), chosen, of_each, seed=0)
-        rays, truth = _as_rays(mixture, *_bundle_of(self.manager, batch))
+        rays = _rays_of(mixture, _bundle_of(self.manager, batch)[0])
         of_pictures = batch["indices"][:, 0] == chosen[:, None]
         return [
-            (Rays._make(None if part is None else part[own] for part in rays), truth[own])
+            Rays._make(None if part is None else part[own] for part in rays)
             for own in of_pictures.to(mixture.device)
             if bool(own.any())
         ]
+
+    def of_tests(self, mixture: Mixture, count: int, of_each: int) -> list[Rays]:
+        """Rays of each of up to `count` test photographs; none where one of them trains too."""
+        tests: Any = getattr(self.manager, "eval_dataset", None) or []
+        trained = {*self.manager.train_dataset.image_filenames} if len(tests) else set()
+        if len(tests) == 0 or not trained.isdisjoint(tests.image_filenames):
+            return []
+        chosen = spread_evenly(len(tests), count)
+        bundles = bundles_of_tests(self.manager, chosen, of_each)
+        found = [rays.to(mixture.device) for rays, _ in bundles]
+        return [mixture.rays(rays.origins, rays.directions, None) for rays in found]
 
     def held_out(
         self, mixture: Mixture, count: int, seed: int = 0, share: Share = "calibration"
@@ -178,6 +191,24 @@ def training_bundles(manager: Any, count: int) -> Iterator[Any]:
         bundle, _ = manager.next_train(0)
         drawn += len(bundle)
         yield bundle
+
+
+def bundles_of_tests(
+    manager: Any, numbers: Iterable[int], of_each: int
+) -> Iterator[tuple[RayBundle, Tensor]]:
+    """Rays of pixels of test photographs, less those that a lens or mask hides, and their colours
+    [R, 3 or 4]: the same at every call. A photograph of which nothing is left is passed over."""
+    dataset, generator = manager.eval_dataset, torch.Generator().manual_seed(0)
+    cameras = dataset.cameras.to("cpu")
+    for number in numbers:
+        data = dataset.get_data(number)
+        image = data["image"]
+        drawn = [torch.randint(side, (of_each,), generator=generator) for side in image.shape[:2]]
+        pixels = torch.stack(drawn, dim=-1)
+        pixels = pixels[visible_in_test(manager, number, data, pixels)]
+        if len(pixels) > 0:
+            rays = cameras.generate_rays(camera_indices=number, coords=pixels + 0.5)
+            yield rays, image[tuple(pixels.T)]
 
 
 def held_out_bundle(

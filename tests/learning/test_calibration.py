@@ -19,11 +19,12 @@ from leco_plugin.learning.calibration import (
     backdrop_price,
     calibrate,
     image_price,
+    lost_by_each,
     measure,
     promise,
     ray_prices,
     thresholds_below,
-    worst_loss,
+    worst_of,
 )
 from leco_plugin.learning.dense import (
     SURFACE_STEPS,
@@ -158,12 +159,12 @@ def test_no_photograph_that_vouches_loses_more_than_its_bound() -> None:
     cameras = [Chunk(seed).reference for seed in (12, 13, 17, 25, 36, 39, 42, 43, 44)]
     alone = calibrate(problem.rendering(), config)
     lower = THRESHOLDS[THRESHOLDS.index(alone.threshold) + 1]
-    bound, allowed = (worst_loss(cameras, one) for one in (lower, alone.threshold))
+    bound, allowed = (worst_of(lost_by_each(cameras, one)) for one in (lower, alone.threshold))
     assert allowed > bound > config.camera_surface_mass
     narrow = replace(config, camera_surface_mass=bound)
     found = calibrate(problem.rendering(), narrow, cameras=cameras)
     assert found == measure(problem.rendering(), lower)
-    promised = promise(cameras, found, narrow)
+    promised = promise(lost_by_each(cameras, found.threshold), narrow)
     assert promised["worst_surface_mass"] == promised["bound"] == bound
     assert (promised["count"], promised["confidence"]) == (9, 0.9)
 
@@ -172,10 +173,8 @@ def test_no_photograph_that_vouches_loses_more_than_its_bound() -> None:
     earlier = allowed - bound
     spent = {CAMERAS_THAT_VOUCH: {"worst_surface_mass": earlier}}
     assert calibrate(problem.rendering(), config, cameras=cameras, spent=spent).threshold == lower
-    promised = promise(cameras, alone, config, spent)
-    assert promised["worst_surface_mass"] == promised["bound"] == allowed + earlier
-    assert promise(cameras, measure(problem.rendering(), 0.0), config, spent)["bound"] == allowed
-    assert promised["confidence"] is None  # they have taught the second gate themselves
+    assert promise([0.0, earlier], config)["bound"] == allowed
+    assert promise([0.0], config, taught=True)["confidence"] is None
     beyond = {CAMERAS_THAT_VOUCH: {"worst_surface_mass": 2.0 * allowed}}
     # a view that is lost already does not give up the others
     assert calibrate(problem.rendering(), narrow, cameras=cameras, spent=beyond) == found
@@ -187,8 +186,9 @@ def test_a_view_that_no_threshold_does_justice_to_lowers_nothing_and_is_said() -
     strange = strange._replace(occupancies=torch.zeros_like(strange.occupancies))
     alone = calibrate(problem.rendering(), config)
     assert calibrate(problem.rendering(), config, cameras=[strange]) == alone
-    assert promise([strange], alone, config)["bound"] == pytest.approx(1.0)
-    assert promise([], alone, config) is None
+    lost = lost_by_each([strange], alone.threshold)
+    assert promise(lost, config)["bound"] == pytest.approx(1.0)
+    assert promise([], config) is None
 
 
 @pytest.mark.parametrize(("more", "followed"), [(24, True), (26, False)])
@@ -211,20 +211,20 @@ def test_vouching_photographs_keep_a_quarter_more(more: int, followed: bool) -> 
 
 
 def test_what_a_photograph_loses_never_falls_as_the_threshold_rises() -> None:
-    losses = [worst_loss([Chunk(3).reference], threshold) for threshold in reversed(THRESHOLDS)]
+    losses = [lost_by_each([Chunk(3).reference], one)[0] for one in reversed(THRESHOLDS)]
     assert losses == sorted(losses) and losses[0] < losses[-1] < 1.0
 
 
 def test_a_photograph_whose_loss_is_no_number_vouches_for_nothing() -> None:
     problem, sound = Problem(0), Chunk(3).reference
     broken = sound._replace(weights=sound.weights.masked_fill(sound.near_surface, math.nan))
-    assert math.isnan(worst_loss([sound, broken, sound], 0.1))
+    assert math.isnan(worst_of(lost_by_each([sound, broken, sound], 0.1)))
     config = CalibrationConfig(1.0, 100.0, camera_surface_mass=1.0)
     trusting = calibrate(problem.rendering(), config, cameras=[sound])
     doubting = calibrate(problem.rendering(), config, cameras=[broken])
     assert trusting.threshold == doubting.threshold == THRESHOLDS[0]
-    assert not math.isnan(promise([sound], trusting, config)["bound"])
-    assert math.isnan(promise([broken], doubting, config)["bound"])
+    assert not math.isnan(promise(lost_by_each([sound], 0.1), config)["bound"])
+    assert math.isnan(promise(lost_by_each([broken], 0.1), config)["bound"])
 
 
 def test_nothing_is_skipped_when_no_threshold_fits() -> None:

@@ -15,12 +15,13 @@ from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from small_learner import SMALLEST, NoPixels, small_mixture
 
 from leco_plugin.learning import held_out as module
-from leco_plugin.learning.calibration import THRESHOLDS, CalibrationConfig, measure
+from leco_plugin.learning.calibration import THRESHOLDS, CalibrationConfig, lost_by_each, measure
 from leco_plugin.learning.dense import dense_reference, dense_rendering, evaluating
 from leco_plugin.learning.held_out import HeldOut
 from leco_plugin.learning.quality import FIELD, ONE_COLOUR
 from leco_plugin.learning.sharpening import SharpeningConfig
 from leco_plugin.models.objective import GateLossConfig
+from leco_plugin.occupancy import TESTS_LOSE
 from leco_plugin.scenes import learning_data
 from leco_plugin.scenes.learning_data import count_held_out, held_out_bundle, held_out_rays
 from leco_plugin.scenes.pixels.held_out_pixels import HeldOutPixelSampler
@@ -156,6 +157,7 @@ def test_a_careful_price_is_that_of_a_quarter_of_the_threshold(
     mixture, truth, data = small_mixture(), torch.rand(9, 3), NoPixels()
     rays = mixture.rays(data.survey.origins, data.survey.directions, None)
     data.held_out = lambda *_: (rays, truth)  # type: ignore[method-assign]
+    data.of_tests = lambda *_: [rays]  # type: ignore[method-assign]
     monkeypatch.setattr(module, "calibrate", lambda given, *_, **__: measure(given, calibrated))
     config = CalibrationConfig()
     held_out = HeldOut(mixture, data, config, restarted=False)  # type: ignore[arg-type]
@@ -164,7 +166,9 @@ def test_a_careful_price_is_that_of_a_quarter_of_the_threshold(
         rendering = dense_rendering(mixture, rays, truth, config.rays_at_once)
         assert measured == measure(rendering, careful)
         assert within == measure(rendering, calibrated)
+        assert report[TESTS_LOSE] == lost_by_each([dense_reference(mixture, rays)], careful)
     assert report["threshold"] == careful
+    assert TESTS_LOSE not in held_out.price()[2], "no small gate follows that would add to it"
 
 
 def test_all_photographs_teach_the_small_gate() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from small_learner import SMALLEST, ARun, small_learner, small_mixture
 from torch import Tensor
 
 from leco_plugin.learning import sharpening
-from leco_plugin.learning.calibration import CalibrationConfig, Measured
+from leco_plugin.learning.calibration import CalibrationConfig, Measured, lost_by_each
 from leco_plugin.learning.dense import dense_rendering
 from leco_plugin.learning.history import as_learned
 from leco_plugin.learning.learner import Learner
@@ -21,6 +22,7 @@ from leco_plugin.learning.sharpening import (
     Lesson,
     Sharpened,
     SharpeningConfig,
+    _rescore,
     guided_reference,
     lesson_from_field,
     sharpen,
@@ -30,7 +32,7 @@ from leco_plugin.models.gate import Gate, GateConfig
 from leco_plugin.models.mixture import Mixture
 from leco_plugin.models.objective import GateLossConfig
 from leco_plugin.models.rendering import Rays
-from leco_plugin.occupancy import CAMERAS_THAT_VOUCH, Occupancy
+from leco_plugin.occupancy import CAMERAS_THAT_VOUCH, TESTS_LOSE, Occupancy
 from leco_plugin.scenes.input_error import InputError
 
 GATE = GateConfig(EncodingConfig(octaves=2), 16, 1, 1, normed=False)
@@ -129,7 +131,7 @@ def test_a_small_gate_skips_what_the_large_one_keeps_of_free_space() -> None:
     mixture = a_mixture()
     taught, held_out = some_rays(mixture, 400), (some_rays(mixture, 100), torch.ones(100, 3))
     config = SharpeningConfig(steps=150, gate=GATE)
-    found = sharpen(mixture, taught, held_out, [], LOSSES, CalibrationConfig(), config)
+    found = sharpen(mixture, taught, held_out, [], [], LOSSES, CalibrationConfig(), config)
     assert found.pays and found.measured.empty_fraction > found.before.empty_fraction + 0.1
     assert found.measured.within(CalibrationConfig()) and found.measured.threshold > 0.0
     assert mixture.small is None, "it only says what would be"
@@ -139,15 +141,36 @@ def test_a_small_gate_skips_what_the_large_one_keeps_of_free_space() -> None:
 def test_a_small_gate_may_cost_only_what_the_large_one_has_left() -> None:
     mixture, bounds = a_mixture(), CalibrationConfig()
     data = some_rays(mixture, 400), (some_rays(mixture, 100), torch.ones(100, 3))
-    views = [(some_rays(mixture, 50), torch.ones(50, 3))]
+    views = [some_rays(mixture, 50)], [some_rays(mixture, 50)]  # of the latter, nothing is known
     config = SharpeningConfig(steps=150, gate=GATE)
     mixture.report = report_of(0.6) | {CAMERAS_THAT_VOUCH: vouched(0.001, 0.002)}
-    found = sharpen(mixture, *data, views, LOSSES, bounds, config)
+    found = sharpen(mixture, *data, *views, LOSSES, bounds, config)
     assert found is not None and found.measured.threshold > 0.0 and found.promised is not None
     assert found.promised["worst_surface_mass"] >= 0.001 and found.promised["confidence"] is None
     mixture.report |= {"lost_surface_mass": 2.0 * bounds.lost_surface_mass}
-    spent = sharpen(mixture, *data, views, LOSSES, bounds, config)
+    spent = sharpen(mixture, *data, *views, LOSSES, bounds, config)
     assert spent is not None and spent.measured.threshold == 0.0 and not spent.pays
+
+
+def test_a_new_view_loses_to_both_gates_what_test_photographs_do() -> None:
+    mixture, bounds = a_mixture(), CalibrationConfig()
+    data = some_rays(mixture, 400), (some_rays(mixture, 100), torch.ones(100, 3))
+    tests = [some_rays(mixture, 50), some_rays(mixture, 50)]
+    so_far = {CAMERAS_THAT_VOUCH: vouched(0.001, 0.002), TESTS_LOSE: [0.004, 0.0]}
+    mixture.report |= so_far
+    found = sharpen(mixture, *data, [], tests, LOSSES, bounds, SharpeningConfig(150, gate=GATE))
+    assert found is not None
+    score, threshold = partial(mixture.occupancies, gate=found.gate), found.measured.threshold
+    with torch.no_grad():
+        again = [_rescore(mixture, score, rays, guided_reference(mixture, rays)) for rays in tests]
+    first, second = lost_by_each(again, threshold)
+    assert found.tests_lose == pytest.approx([0.004 + first, second]) and threshold > 0.0
+    worst = max(found.tests_lose)
+    expected = {"count": 2, "worst_surface_mass": worst, "confidence": 0.667}
+    assert found.promised == expected | {"bound": max(worst, bounds.camera_surface_mass)}
+    report = found.report(mixture.report, SMALLEST.gate)
+    assert report[CAMERAS_THAT_VOUCH] == found.promised
+    assert report[TESTS_LOSE] == found.tests_lose
 
 
 def test_only_what_is_kept_is_taught_and_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -162,7 +185,7 @@ def test_only_what_is_kept_is_taught_and_rendered(monkeypatch: pytest.MonkeyPatc
     mixture = a_mixture()
     data = some_rays(mixture, 30), (some_rays(mixture, 10), torch.ones(10, 3))
     config = SharpeningConfig(steps=1, gate=GATE)
-    sharpen(mixture, *data, [], LOSSES, CalibrationConfig(), config)
+    sharpen(mixture, *data, [], [], LOSSES, CalibrationConfig(), config)
     assert shares == [1.0, 1.0], "the lesson, then prices"
 
 
@@ -180,6 +203,9 @@ class Pixels:
         return some_rays(mixture, 60), torch.ones(60, 3)
 
     def of_vouching(self, *_: Any) -> list[Any]:
+        return []
+
+    def of_tests(self, *_: Any) -> list[Any]:
         return []
 
     def prepare_batch(self, *_: Any, **__: Any) -> None:

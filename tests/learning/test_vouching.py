@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from small_learner import small_mixture
@@ -92,6 +93,35 @@ def test_pictures_of_several_sizes_vouch_too(data: LearningData) -> None:
     assert torch.equal(batch["image"][:, 0], batch["indices"][:, 0].float())
     found = sampler.sample_pictures(dict(data.manager.images), data.vouching(4), 20, seed=0)
     assert found["image"][:, 0].tolist() == [5.0] * 20 + [15.0] * 20 + [25.0] * 20 + [35.0] * 20
+
+
+class Photographs(list[str]):
+    """Test photographs of these names, of 4 x 5 pixels; the second is masked."""
+
+    cameras = Cameras(torch.eye(4)[None, :3].repeat(3, 1, 1), 5.0, 5.0, 2.5, 2.0, 5, 4)
+
+    @property
+    def image_filenames(self) -> list[str]:
+        return self
+
+    def get_data(self, number: int) -> dict[str, torch.Tensor]:
+        mask = torch.full((4, 5, 1), number != 1)
+        return {"image": torch.zeros(4, 5, 3), "mask": mask}
+
+
+@pytest.mark.parametrize(("last", "counts"), [("c", [7, 7]), ("d", [])])
+def test_test_photographs_say_what_new_views_lose_unless_they_train(
+    last: str, counts: list[int], data: LearningData
+) -> None:
+    data.manager.train_dataset = SimpleNamespace(image_filenames=["d", "e"])
+    data.manager.eval_dataset = Photographs(["a", "b", last])
+    found = data.of_tests(small_mixture(), 9, 7)
+    assert [len(rays.origins) for rays in found] == counts
+    assert all(rays.images is None for rays in found), "they have no codes of their own"
+    again = data.of_tests(small_mixture(), 9, 7)
+    assert all(torch.equal(a.directions, b.directions) for a, b in zip(found, again))
+    del data.manager.eval_dataset
+    assert data.of_tests(small_mixture(), 9, 7) == []
 
 
 SAID = {"count": 9, "worst_surface_mass": 0.00123, "bound": 0.002, "confidence": 0.9}
