@@ -333,8 +333,8 @@ RULES = (
     Rule(
         "held-out-images-teach-nothing",
         "a figure on test images says nothing if they were trained on.",
-        "have next_train draw from train_dataset alone, read eval_dataset in no training step or "
-        "callback, and let the data parser give no image to both splits.",
+        "have next_train draw from train_dataset alone, let nothing that learns read eval_dataset, "
+        "and let the data parser give no image to both splits.",
     ),
     Rule(
         "resumes-where-it-stopped",
