@@ -40,7 +40,6 @@ from leco_plugin.export_surface import (
     in_comments,
     kept_surface,
     require_few,
-    require_not_its_own,
     require_start,
     shown_part,
     write_ply,
@@ -114,8 +113,7 @@ def export(
         description = scene_of(occupancy, file, data)
         if format == "splat-init":
             require_start(out, description)
-        elif description is not None:
-            require_not_its_own(out, description)
+        check_apart({"--out": out}, description)
         surface = surface or kept_surface(occupancy, resolution)
         facts = _export_points(occupancy, surface, format, out, back, description)
     known = {"format": 1, "written": format, "resolution": resolution}

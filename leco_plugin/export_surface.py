@@ -42,7 +42,7 @@ from leco_plugin.scenes.frames import applied_in, inverse, moved
 from leco_plugin.scenes.input_error import InputError
 from leco_plugin.scenes.photograph_files import find_file
 from leco_plugin.scenes.scene_file import load_json
-from leco_plugin.scenes.whole_files import write_json, write_points, write_whole
+from leco_plugin.scenes.whole_files import check_apart, write_json, write_points, write_whole
 
 CELLS = 128
 """Along each side of a cube."""
@@ -247,18 +247,7 @@ def require_start(out: Path, description: Path | None) -> None:
         raise InputError("a start for splats copies transforms.json: give --data SCENE")
     if out.suffix != ".json":
         raise InputError(f"--out {out}: a start for splats is a copy of transforms.json; end it so")
-    for file in (out, out.with_suffix(".ply")):
-        require_not_its_own(file, description)
-
-
-def require_not_its_own(out: Path, description: Path) -> None:
-    """InputError if a file to write is a scene's own transforms.json, or its sparse points."""
-    own = load_json(description).get("ply_file_path")
-    files = {description.resolve(): description.name}
-    if isinstance(own, str):
-        files[find_file(description.parent / own).resolve()] = "points"
-    if kind := files.get(out.resolve()):
-        raise InputError(f"--out {out} is the scene's own {kind}: give another name")
+    check_apart({"--out": out, "the points of --out": out.with_suffix(".ply")}, description)
 
 
 def _from_elsewhere(meta: dict[str, Any], scene: Path, folder: Path) -> dict[str, Any]:

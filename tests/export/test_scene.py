@@ -168,9 +168,15 @@ def test_what_does_not_go_together_is_refused_in_one_line_before_the_gate_is_ask
     own = scene / "transforms.json"
     monkeypatch.setattr("leco_plugin.export.kept_surface", lambda *_: pytest.fail("asked"))
     for options, said in (
-        (("splat-init", own, 24, None, None, scene), "the scene's own transforms.json"),
-        (("ply", scene / "points.ply", 24, None, None, scene), "the scene's own points"),
-        (("splat-init", scene / "points.json", 24, None, None, scene), "the scene's own points"),
+        (("splat-init", own, 24, None, None, scene), "^--out .*s.json is a file that"),
+        (
+            ("ply", scene / "points.ply", 24, None, None, scene),
+            "^--out .*points.ply is a file that",
+        ),
+        (
+            ("splat-init", scene / "points.json", 24, None, None, scene),
+            "^the points of --out",
+        ),
         (("splat-init", tmp_path / "t.ply", 24, None, None, scene), "end it so"),
         (("splat-init", tmp_path / "t.json", 24), "give --data"),
         (("splat-init", tmp_path / "t.json", 24, None, "run", scene), "lies in the data"),
