@@ -395,6 +395,13 @@ def test_what_lies_outside_the_walls_is_empty_also_after_a_round_trip(tmp_path: 
         assert torch.equal(same_place.occupied(positions), between)
 
 
+def test_walls_stay_where_they_were_given() -> None:
+    walls = torch.tensor([-1.0, -1.0, -0.2, 1.0, 1.0, 0.3])
+    made, given = occupancy(walls=walls), walls.clone()
+    walls.zero_()
+    assert torch.equal(made.walls, given)
+
+
 def test_a_wall_is_where_it_is_said_to_be_though_there_is_none_on_the_other_side() -> None:
     walls = torch.tensor([-1e6, -1e6, 0.1234567, 1e6, 0.3, 1e6])
     occupancy = Occupancy(Gate(GateConfig()), Space(), 1e-6, walls=walls)

@@ -95,6 +95,14 @@ def test_unseen_space_is_empty_whatever_the_gate_says(kind: SpaceKind) -> None:
         assert float(differing) < 1e-3
 
 
+def test_the_faces_of_a_space_belong_to_it_and_may_be_unseen() -> None:
+    seen = SeenSpace()
+    seen.cells.zero_()
+    faces = torch.tensor([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [1.0, 1.0, 1.0], [1.01, 0.0, 0.0]])
+    asked = Occupancy(occupancy().gate, Space("box"), 0.5, seen=seen)
+    assert asked.unseen(faces).tolist() == [True, True, True, False]
+
+
 def test_a_region_notes_rays_between_its_walls() -> None:
     region = Region()
     walls = torch.tensor([-NO_WALL, -NO_WALL, -0.5, NO_WALL, NO_WALL, 0.5])

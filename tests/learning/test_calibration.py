@@ -308,6 +308,14 @@ def test_a_price_may_lie_one_standard_error_beyond_its_bound(errors: float, fits
     assert surface.within(CONFIG) == image.within(CONFIG) == fits
 
 
+@pytest.mark.parametrize(("times", "fits"), [(9.9, True), (10.1, False)])
+def test_a_price_is_at_most_ten_times_its_bound_by_any_error(times: float, fits: bool) -> None:
+    mass, price = times * CONFIG.lost_surface_mass, times * CONFIG.image_price_db
+    surface = Measured(0.5, mass, 0.0, 0.0, 0.5, 9.0, 9.0)
+    image = Measured(0.5, 0.0, 0.0, price, 0.5, 9.0, 9.0)
+    assert surface.within(CONFIG) == image.within(CONFIG) == fits
+
+
 def test_one_ray_of_a_few_does_not_decide_and_many_do() -> None:
     for scene, fits in ((Problem(0), True), (Problem(1), False)):
         for reference in scene.references:

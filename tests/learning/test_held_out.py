@@ -183,3 +183,18 @@ def test_all_photographs_teach_the_small_gate() -> None:
             GateLossConfig(), SharpeningConfig(rays=123)
         )
     assert found.value.args == (123,)
+
+
+def test_of_a_restarted_field_lost_surfaces_never_count_as_too_much() -> None:
+    torch.manual_seed(0)
+    mixture, data = small_mixture(), NoPixels()
+    mixture.freeze(0.9, {})
+    rays = mixture.rays(data.survey.origins, data.survey.directions, None)
+    data.held_out = lambda *_: (rays, torch.rand(9, 3))  # type: ignore[method-assign]
+    config = CalibrationConfig(lost_surface_mass=0.0)
+
+    def excess(restarted: bool) -> torch.Tensor:
+        held_out = HeldOut(mixture, data, config, restarted)  # type: ignore[arg-type]
+        return held_out.excesses(0)["lost surface mass"]
+
+    assert (excess(restarted=False) > 0.0).any() and (excess(restarted=True) <= 0.0).all()

@@ -103,6 +103,10 @@ def test_the_lesson_is_the_widened_weight_of_every_candidate() -> None:
     assert (lesson.skip[met] < 0.5).any() and (lesson.skip[x < front[0] - 0.05] == 1.0).all()
     assert (lesson.skip[x > 0.5] == 1.0).all(), "what no ray reaches has nothing to say"
     assert len(x) > 20 * 50, "candidates that are skipped teach too"
+    rays = some_rays(mixture, 5)
+    every = mixture.with_backdrops(rays, mixture.candidates(rays))
+    taught = lesson_from_field(mixture, rays, LOSSES, 0.125, 8).mapped
+    assert len(taught) == len(every.t_starts) - 5, "and no backdrop, which no gate skips"
 
 
 def test_only_what_is_seen_is_rendered_and_the_lesson_is_the_same() -> None:

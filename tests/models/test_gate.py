@@ -82,6 +82,16 @@ def test_logits_are_float32_under_autocast() -> None:
         assert Gate(GateConfig(width=8))(torch.rand(5, 3)).dtype == torch.float32
 
 
+def test_gates_of_the_same_values_and_other_sizes_decide_otherwise() -> None:
+    config = GateConfig(EncodingConfig("hash", levels=2, log2_table=5, finest=16), width=8)
+    finer = replace(config, encoding=replace(config.encoding, finest=32))
+    gate, same, other = Gate(config), Gate(config), Gate(finer)
+    for each in (same, other):
+        for parameter, its in zip(each.parameters(), gate.parameters(), strict=True):
+            parameter.data.copy_(its.data)
+    assert gate.decides_as(same) and not gate.decides_as(other)
+
+
 def test_without_a_norm_features_keep_their_lengths() -> None:
     torch.manual_seed(0)
     gate, mapped = Gate(GateConfig(width=16, normed=False)), torch.rand(100, 3) * 2 - 1

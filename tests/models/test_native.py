@@ -179,6 +179,18 @@ def test_weights_in_other_strides_are_read_as_they_are() -> None:
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
 
 
+def test_one_part_of_a_batch_without_memory_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else the room of that part is read, which nobody has written to."""
+    found = {0: 3, 4: 2}
+    monkeypatch.setattr(native, "RAYS_AT_ONCE", 4)
+    monkeypatch.setattr(native, "routine_of", lambda _: lambda begin, end: found[begin.value])
+    rooms = 10 * torch.arange(8)
+    assert native.call_along_rays("march_cells", rooms) == [slice(0, 3), slice(40, 42)]
+    found[4] = -1
+    with pytest.raises(MemoryError, match="no memory for a batch of rays"):
+        native.call_along_rays("march_cells", rooms)
+
+
 def test_without_a_compiler_torch_answers_and_the_log_says_so(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -251,6 +251,13 @@ def test_twins_only_is_over_afterwards() -> None:
     assert not fused._off
 
 
+def test_what_had_failed_before_twins_only_stays_off(monkeypatch) -> None:
+    monkeypatch.setattr(fused, "_off", {"march"})
+    with fused.twins_only():
+        assert fused._off == {"gate", "march"}
+    assert fused._off == {"march"}
+
+
 @pytest.mark.gpu
 def test_sampling_waits_once_for_the_device() -> None:
     made = LearnedOccupancyEstimator(copy.deepcopy(ball()).cuda(), tolerance=0.02)

@@ -114,3 +114,9 @@ def test_answers_of_another_shape_are_named(scene):
     n = len(samples[0])
     with pytest.raises(ValueError, match=rf"must answer \[{n}\], got \[{n}, 1\]"):
         prune(samples, N_RAYS, sigma_fn=lambda *_: torch.ones(n, 1))
+
+
+def test_a_sample_exactly_as_opaque_as_asked_is_worth_shading():
+    alphas, one_ray = torch.tensor([0.5, 0.25, 0.125]), torch.zeros(3, dtype=torch.int64)
+    seen = packed.render_visibility_from_alpha(alphas, None, one_ray, 1, alpha_thre=0.25)
+    assert seen.tolist() == [True, True, False]

@@ -12,6 +12,7 @@ from tiny_scene import camera_to_world
 from torch import Tensor
 
 from leco_plugin.samplers.boxes import intersect_box
+from leco_plugin.scenes import bounds as module
 from leco_plugin.scenes.bounds import (
     BoundsConfig,
     SceneBounds,
@@ -171,6 +172,14 @@ def test_points_that_are_left_out_are_told_whatever_is_configured(space) -> None
     assert bounds.reason.endswith("; 1 sparse point far from all others is left out")
 
 
+def test_points_left_out_of_a_large_cloud_are_counted_as_if_all_were_looked_at(monkeypatch) -> None:
+    monkeypatch.setattr(module, "CLOUD", 1010)  # every second one of 2020
+    poses, directions, points = from_above()
+    strays = 200.0 * torch.randn(20, 3, generator=torch.Generator().manual_seed(1))
+    reason = find_bounds(poses, directions, torch.cat([points, strays])).reason
+    assert reason.endswith("; 20 sparse points far from all others are left out")
+
+
 def test_a_survey_around_one_dense_building_is_no_stray() -> None:
     poses, directions, points = from_above()
     building = torch.cat([points * 0.01 + shift for shift in torch.linspace(0.0, 0.4, 10)])
@@ -258,6 +267,13 @@ def test_without_points_near_and_far_are_quantiles_of_where_rays_meet_the_altitu
     )
     assert bounds.near == pytest.approx(0.75 * begins[round(0.01 * (len(begins) - 1))], rel=1e-5)
     assert bounds.far == pytest.approx(1.05 * ends[round(0.999 * (len(ends) - 1))], rel=1e-5)
+
+
+def test_rays_of_cameras_below_the_top_begin_a_thousandth_of_the_farthest_away() -> None:
+    """They are 10 above the ground, and the altitudes end at 12."""
+    poses, directions, _ = from_above()
+    bounds = find_bounds(poses, directions, None, BoundsConfig(altitudes=(-0.5, 12.0)))
+    assert bounds.far > 10.5 and bounds.near == pytest.approx(1e-3 * bounds.far)
 
 
 def test_bounds_grow_with_the_scene() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from torch import nn
 
@@ -26,3 +27,17 @@ def test_its_tensors_stay_as_they_are() -> None:
 def test_its_model_is_trained_as_it_is() -> None:
     model = nn.Linear(1, 1)
     assert ranks.averaging(model, CPU) is model
+
+
+def test_tensors_in_other_strides_are_shared_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    firsts = [torch.rand(3, 2), torch.rand(2, 3)]
+    sent = iter(firsts)
+
+    def broadcast(given: torch.Tensor, src: int) -> None:
+        given.copy_(next(sent).contiguous().view(-1).view(torch.uint8))
+
+    monkeypatch.setattr(ranks, "is_distributed", lambda: True)
+    monkeypatch.setattr(ranks.distributed, "broadcast", broadcast)
+    values = [torch.zeros(3, 2), torch.zeros(3, 2).T]
+    ranks.share(values)
+    assert all(map(torch.equal, values, firsts))
