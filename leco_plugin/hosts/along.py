@@ -42,7 +42,7 @@ from leco_plugin.models.gate import Gate
 from leco_plugin.models.leco_config import LecoModelConfig
 from leco_plugin.models.region import Region
 from leco_plugin.models.rendering import Intervals
-from leco_plugin.occupancy import CALIBRATED_AT, CAMERAS_THAT_VOUCH, Occupancy
+from leco_plugin.occupancy import CALIBRATED_AT, CAMERAS_THAT_VOUCH, TESTS_LOSE, Occupancy
 from leco_plugin.samplers.base import midpoints, prune
 from leco_plugin.samplers.estimator import LearnedOccupancyEstimator
 from leco_plugin.samplers.packed import accumulate_along_rays, pack_info, render_weight_from_density
@@ -61,7 +61,7 @@ NO_ERROR = 1e-12
 """Summed squared error of rays that is as good as none."""
 BOUNDED = ("lost_surface_mass", "image_price_db")
 """What calibration bounds, by its names in a config and in a report."""
-OF_A_GATE = (CALIBRATED_AT, CAMERAS_THAT_VOUCH)
+OF_A_GATE = (CALIBRATED_AT, CAMERAS_THAT_VOUCH, TESTS_LOSE)
 """What a report says of one gate alone, and not of the next."""
 LOWER = 3
 """Steps of `THRESHOLDS` from one that costs too much to the next that is tried."""
