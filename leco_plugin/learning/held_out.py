@@ -147,8 +147,9 @@ class HeldOut(PriceSource):
     def sharpened(self, losses: GateLossConfig, config: SharpeningConfig) -> Sharpened | None:
         """A small gate that training pixels teach and these calibrate; see `sharpen`."""
         taught = self.data.training_rays(self.mixture, config.rays)
-        rays, views = self.rays(self.config.rays), (self.cameras(), self.tests())
-        return sharpen(self.mixture, taught, rays, *views, losses, self.config, config)
+        rays, cameras = self.rays(self.config.rays), self.cameras()
+        tests = self.tests() if self.mixture.report.get(TESTS_LOSE) else []
+        return sharpen(self.mixture, taught, rays, cameras, tests, losses, self.config, config)
 
     def unneeded(self, count: int, bound: float) -> Merging:
         """Scene experts without which the image loses no more than `bound` dB."""

@@ -198,3 +198,18 @@ def test_of_a_restarted_field_lost_surfaces_never_count_as_too_much() -> None:
         return held_out.excesses(0)["lost surface mass"]
 
     assert (excess(restarted=False) > 0.0).any() and (excess(restarted=True) <= 0.0).all()
+
+
+@pytest.mark.parametrize(("so_far", "asked"), [({TESTS_LOSE: [0.0]}, ["a test"]), ({}, [])])
+def test_test_photographs_are_asked_of_a_small_gate_if_they_were_of_the_first(
+    so_far: dict[str, Any], asked: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mixture, data, given = small_mixture(), NoPixels(), []
+    mixture.freeze(0.5, so_far)
+    data.training_rays = data.held_out = lambda *_: None  # type: ignore
+    data.of_tests = lambda *_: ["a test"]  # type: ignore[method-assign]
+    monkeypatch.setattr(module, "sharpen", lambda *every: given.append(every[4]))
+    HeldOut(mixture, data, CONFIG, restarted=False).sharpened(  # type: ignore[arg-type]
+        GateLossConfig(), SharpeningConfig()
+    )
+    assert given == [asked]
