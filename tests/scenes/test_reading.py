@@ -659,7 +659,7 @@ def test_what_git_lfs_has_not_fetched_is_named(scene: Path) -> None:
 def test_what_colmap_lacks_has_its_own_remedy(scene: Path) -> None:
     config = as_colmap(scene)
     (scene / "images").rename(scene / "input")
-    with refused(r"images/000\.png'; name the folder .*--images-path"):
+    with refused(r"images/000\.png; name the folder .*--images-path"):
         read(config)
     (scene / "input").rename(scene / "images")
     (scene / "train_list.txt").write_text("000.png\n\n")
@@ -686,7 +686,7 @@ def test_an_ending_that_the_reader_adds_is_to_be_left_off(ending: str, scene: Pa
     for frame in meta["frames"]:
         frame["file_path"] += ending
     (scene / "transforms_train.json").write_text(json.dumps(meta))
-    with refused(rf"000{ending}\.png'; blender-data adds \.png .* leave endings off$"):
+    with refused(rf"000{ending}\.png; blender-data adds \.png .* leave endings off$"):
         read(config)
 
 
