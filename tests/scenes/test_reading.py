@@ -670,7 +670,7 @@ def test_what_colmap_lacks_has_its_own_remedy(scene: Path) -> None:
         read(config)
     (scene / "test_list.txt").unlink()
     (scene / "images/000.png").rename(scene / "images/000.PNG")
-    with refused(r"images/000\.png'; there is 000\.PNG, write its name like that"):
+    with refused(r"images/000\.png; there is 000\.PNG, write its name like that"):
         read(config)
     (scene / "images/000.PNG").rename(scene / "images/000.png")
     of_images = scene / "sparse/0/images.txt"
